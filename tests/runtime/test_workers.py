@@ -2,8 +2,10 @@
 
 import os
 import random
+import socket
 import subprocess
 import sys
+import threading
 import time
 import types
 from collections.abc import Iterator
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 from support import two_nodes
 
-from lexsplat.runtime import ray_tasks, ray_workers
+from lexsplat.runtime import ray_connection, ray_tasks, ray_workers
 from lexsplat.runtime.errors import CaptureError, TaskError, WorkersError
 from lexsplat.runtime.progress import NOTE
 from lexsplat.runtime.workers import IN_PROCESS, Needs, SharedFolder, check_spec, open_workers, results
@@ -120,8 +122,28 @@ def test_a_server_of_the_client_that_did_not_start_in_time_is_asked_once_more(mo
             )
 
     monkeypatch.setitem(sys.modules, "ray", types.SimpleNamespace(init=init))
-    ray_workers._connect("ray://head:10001", answers=True)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        ray_connection.connect(f"ray://127.0.0.1:{listening.getsockname()[1]}")
     assert len(tried) == 2
+
+
+def test_a_ray_that_does_not_start_is_told_when_its_first_task_is_sent_and_its_thread_ends(monkeypatch):
+    def init(**_):
+        raise RuntimeError("no room for sockets")
+
+    ended = []
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    stand_in = types.SimpleNamespace(
+        init=init, shutdown=lambda: ended.append(threading.current_thread().name)
+    )
+    monkeypatch.setitem(sys.modules, "ray", stand_in)
+    with open_workers("ray") as workers:
+        workers.require(())
+        with pytest.raises(
+            WorkersError, match="Ray at local: expected a running cluster, found no room for sock"
+        ):
+            list(workers.map(two_nodes.one_broken, None, {"0": 0}))
+    assert ended == ["Ray"]
 
 
 @pytest.mark.parametrize("spec", ["slurm", "ray://", "ray://host", "ray://host:port", "ray:", ""])
@@ -161,7 +183,7 @@ def test_nodes_with_another_version_or_none_or_without_the_capture_are_refused()
 
 def test_another_version_of_ray_is_told_with_the_remedy():
     found = RuntimeError("Version mismatch: The cluster was started with:\n Ray: 2.9.0 Python: 3.11.7")
-    assert str(ray_workers._unreachable("head:6379", found)) == (
+    assert str(ray_connection._unreachable("head:6379", found)) == (
         "Ray at head:6379: expected the same version, found Version mismatch: The cluster was started with: "
         "Ray: 2.9.0 Python: 3.11.7; use the same versions of Ray and Python on every machine"
     )
@@ -169,8 +191,8 @@ def test_another_version_of_ray_is_told_with_the_remedy():
 
 def test_a_cluster_that_answers_and_lets_nobody_in_may_want_a_token():
     found = RuntimeError("Failed to connect to Ray cluster at head:6379")
-    assert "RAY_AUTH_MODE=token" in str(ray_workers._unreachable("head:6379", found, answers=True))
-    assert "RAY_AUTH_MODE" not in str(ray_workers._unreachable("head:6379", found))
+    assert "RAY_AUTH_MODE=token" in str(ray_connection._unreachable("head:6379", found, answers=True))
+    assert "RAY_AUTH_MODE" not in str(ray_connection._unreachable("head:6379", found))
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import logging
 import os
-import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,6 +14,7 @@ from typing import Any
 from lexsplat.runtime.environment import code_identity, version_of_lexsplat, versions
 from lexsplat.runtime.errors import WorkersError
 from lexsplat.runtime.progress import NOTE
+from lexsplat.runtime.ray_connection import OwnRay, connect
 from lexsplat.runtime.ray_tasks import Answer, Tasks, no_node, options_of, run, slots, store_full
 from lexsplat.runtime.ray_watch import ClusterLostError, HeadWatch
 from lexsplat.runtime.workers import ANY_MACHINE, Needs, Outcome, R, S, SharedFolder, T, Workers
@@ -22,8 +22,6 @@ from lexsplat.runtime.workers import ANY_MACHINE, Needs, Outcome, R, S, SharedFo
 log = logging.getLogger("lexsplat")
 
 _PROBE_SECONDS = 120.0
-_TOKEN = "; if the cluster was started with a token, set RAY_AUTH_MODE=token and copy ~/.ray/auth_token from its head"
-_WAIT_SECONDS = 5.0
 _RECONNECT = "RAY_gcs_rpc_server_reconnect_timeout_s"
 
 
@@ -52,24 +50,18 @@ def ray_workers(address: str | None, paths: tuple[Path, ...] = ()) -> Iterator[W
             found="none installed",
             remedy="pip install 'lexsplat[cluster]'",
         ) from error
-    host, _, port = place.removeprefix("ray://").rpartition(":")
-    answers = False
-    if host and port.isdigit():  # Ray tries for a minute where nothing listens
-        try:
-            socket.create_connection((host, int(port)), timeout=_WAIT_SECONDS).close()
-        except OSError as error:
-            raise _unreachable(place, error) from error
-        answers = True
-    _connect(place, answers=answers)
+    if place == "local":
+        with OwnRay() as own:
+            yield RayWorkers(HeadWatch(None), own)
+        return
+    connect(place)
     # From within a cluster Ray ends this process where the head is gone; in the other cases it raises.
-    head = None if place == "local" or place.startswith("ray://") else ray.get_runtime_context().gcs_address
+    head = None if place.startswith("ray://") else ray.get_runtime_context().gcs_address
     watch, lost = HeadWatch(head), False
     try:
         with watch:
-            workers = RayWorkers(watch, alone=place == "local")
-            workers.require(paths)
-            log.log(NOTE, "workers: %s nodes, %s cores", len(_nodes()), slots(ANY_MACHINE))
-            yield workers
+            log.log(NOTE, "workers: %s nodes, %s cores", _check_nodes(paths), slots(ANY_MACHINE))
+            yield RayWorkers(watch)
     except ClusterLostError:
         lost = True
         raise
@@ -80,33 +72,19 @@ def ray_workers(address: str | None, paths: tuple[Path, ...] = ()) -> Iterator[W
             ray.shutdown()
 
 
-def _connect(place: str, *, answers: bool, tries: int = 2) -> None:
-    """Connect to Ray; once more where the server of ``ray://`` did not start in time."""
-    import ray
-
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
-    own: dict[str, Any] = {"include_dashboard": False} if place == "local" else {}
-    try:
-        ray.init(address=place, **quiet, **own)
-    except (ConnectionError, RuntimeError, ValueError, TimeoutError, OSError) as error:
-        if tries > 1 and "Initialization failure" in str(error):
-            _connect(place, answers=answers, tries=tries - 1)
-            return
-        raise _unreachable(place, error, answers=answers) from error
-
-
 class RayWorkers:
     """Tasks on the Ray to which this process is connected.
 
     Args:
         watch: Watches its head.
-        alone: Whether Ray runs on this machine only, for this process, so that nodes need no check.
+        own: The Ray of this process alone, if it is one. It is waited for at the first task, and its node, this
+            machine, needs no check.
     """
 
     distributed = True
 
-    def __init__(self, watch: HeadWatch, *, alone: bool = False) -> None:
-        self._watch, self._alone = watch, alone
+    def __init__(self, watch: HeadWatch, own: OwnRay | None = None) -> None:
+        self._watch, self._own = watch, own
         self._running = 0
 
     @property
@@ -116,7 +94,7 @@ class RayWorkers:
 
     def see(self, folder: SharedFolder) -> bool:
         """See `Workers.see`."""
-        if self._alone:
+        if self._own is not None:
             return folder.is_visible
         import ray
 
@@ -128,7 +106,7 @@ class RayWorkers:
 
     def require(self, paths: tuple[Path, ...]) -> None:
         """See `Workers.require`."""
-        if not self._alone:
+        if self._own is None:
             _check_nodes(paths)
 
     def map(
@@ -141,6 +119,8 @@ class RayWorkers:
         """
         import ray
 
+        if self._own is not None:
+            self._own.wait()
         try:
             options = options_of(needs, len(items))
             task = ray.remote(run).options(**options)
@@ -177,8 +157,8 @@ def _sees(folder: SharedFolder) -> bool:
     return folder.is_visible
 
 
-def _check_nodes(paths: tuple[Path, ...]) -> None:
-    """Run a probe on every node.
+def _check_nodes(paths: tuple[Path, ...]) -> int:
+    """Run a probe on every node; returns their number.
 
     Raises:
         WorkersError: If a node cannot do the work.
@@ -211,24 +191,20 @@ def _check_nodes(paths: tuple[Path, ...]) -> None:
             ) from error
         _check_probe(name, found, code, missing)
         _compare(name, packages)
-
-
-def _nodes() -> list[dict[str, Any]]:
-    """The nodes that can compute."""
-    import ray
-
-    return [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
+    return len(answers)
 
 
 def _on_every_node(task: Any, argument: Any) -> dict[str, Any]:
     """References to the answers of all nodes that can compute, by the name of the node."""
+    import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy as OnNode
 
     return {
         node["NodeManagerHostname"] + "/" + node["NodeID"][:6]: task.options(
             num_cpus=0, scheduling_strategy=OnNode(node["NodeID"], soft=True)
         ).remote(argument)
-        for node in _nodes()
+        for node in ray.nodes()
+        if node["Alive"] and node["Resources"].get("CPU")
     }
 
 
@@ -261,20 +237,3 @@ def _compare(node: str, packages: dict[str, str]) -> None:
     ]
     if others:
         log.warning("node %s: other versions, so its bits may differ: %s", node, ", ".join(others))
-
-
-def _unreachable(place: str, error: Exception, *, answers: bool = False) -> WorkersError:
-    """The error to raise; ``answers`` if something listens at the address, so that a token may be missing."""
-    reason = " ".join(str(error).split())[:200]
-    if "ersion mismatch" in reason:
-        remedy = "use the same versions of Ray and Python on every machine"
-        return WorkersError(f"Ray at {place}", expected="the same version", found=reason, remedy=remedy)
-    if "ray[client]" in reason:
-        remedy = "pip install 'lexsplat[cluster]'"
-        return WorkersError(place, expected="the client of Ray", found="no package grpcio", remedy=remedy)
-    return WorkersError(
-        f"Ray at {place}",
-        expected="a running cluster",
-        found=reason or type(error).__name__,
-        remedy="check the address and: ray status" + (_TOKEN if answers else ""),
-    )

@@ -1,0 +1,102 @@
+"""How this process comes to a Ray: a running cluster, or one of its own."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from typing import Any
+
+from lexsplat.runtime.errors import WorkersError
+
+_WAIT_SECONDS = 5.0
+_TOKEN = "; if the cluster was started with a token, set RAY_AUTH_MODE=token and copy ~/.ray/auth_token from its head"
+
+
+def connect(place: str, tries: int = 2) -> None:
+    """Connect to Ray; once more where the server of ``ray://`` did not start in time.
+
+    Args:
+        place: "local" for a Ray of this process alone, an address of a cluster, or "ray://HOST:PORT".
+        tries: How often this is tried.
+
+    Raises:
+        WorkersError: If it is not reached.
+    """
+    import ray
+
+    host, _, port = place.removeprefix("ray://").rpartition(":")
+    named = bool(host) and port.isdigit()
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+    own: dict[str, Any] = {"include_dashboard": False} if place == "local" else {}
+    try:
+        if named:  # Ray tries for a minute where nothing listens
+            socket.create_connection((host, int(port)), timeout=_WAIT_SECONDS).close()
+    except OSError as error:
+        raise _unreachable(place, error) from error
+    try:
+        ray.init(address=place, **quiet, **own)
+    except (ConnectionError, RuntimeError, ValueError, TimeoutError, OSError) as error:
+        if tries > 1 and "Initialization failure" in str(error):
+            connect(place, tries - 1)
+            return
+        raise _unreachable(place, error, answers=named) from error
+
+
+class OwnRay:
+    """A Ray of this process alone, which starts in a thread while the command goes on.
+
+    The thread lives as long as the context: on Linux the processes of Ray end with the thread that starts them.
+    """
+
+    def __init__(self) -> None:
+        self._ready, self._ended = threading.Event(), threading.Event()
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="Ray", daemon=True)
+
+    def __enter__(self) -> OwnRay:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def wait(self) -> None:
+        """Return when tasks can be sent.
+
+        Raises:
+            WorkersError: If Ray does not start.
+        """
+        self._ready.wait()
+        if self._error is not None:
+            raise self._error
+
+    def _run(self) -> None:
+        import ray
+
+        try:
+            connect("local")
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._ready.set()
+        self._ended.wait()
+        ray.shutdown()
+
+
+def _unreachable(place: str, error: Exception, *, answers: bool = False) -> WorkersError:
+    """The error to raise; ``answers`` if something listens at the address, so that a token may be missing."""
+    reason = " ".join(str(error).split())[:200]
+    if "ersion mismatch" in reason:
+        remedy = "use the same versions of Ray and Python on every machine"
+        return WorkersError(f"Ray at {place}", expected="the same version", found=reason, remedy=remedy)
+    if "ray[client]" in reason:
+        remedy = "pip install 'lexsplat[cluster]'"
+        return WorkersError(place, expected="the client of Ray", found="no package grpcio", remedy=remedy)
+    return WorkersError(
+        f"Ray at {place}",
+        expected="a running cluster",
+        found=reason or type(error).__name__,
+        remedy="check the address and: ray status" + (_TOKEN if answers else ""),
+    )
