@@ -72,6 +72,27 @@ def test_a_stage_of_the_next_scene_starts_anew(clock, monkeypatch, capsys):
                 assert bars._progress.tasks[0].finished == (number == 10)
 
 
+def test_each_scene_under_way_has_a_bar_with_its_present_stage(monkeypatch, capsys):
+    events = [
+        Event("scenes", 0, 2), Event("features", 1, 9, scene="attic"), Event("features", 2, 9, scene="bath"),
+        Event("average", 1, 4, scene="attic"), Event("failed", 1, 1, scene="bath"),
+    ]  # fmt: skip
+    with ProgressBars() as bars:
+        for event in events:
+            bars(event)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["scenes: 0/2", "attic: features: 1/9", "bath: features: 2/9", "attic: average: 1/4"]
+    screen = io.StringIO()
+    monkeypatch.setattr(
+        progress, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120, _environ={})
+    )
+    with ProgressBars() as bars:
+        for event in events:
+            bars(event)
+        shown = [(task.description, task.completed, task.total) for task in bars._progress.tasks]
+    assert shown == [("scenes", 0, 2), ("attic: average", 1, 4)]
+
+
 def test_the_rate_of_a_stage_leaves_out_the_time_since_an_earlier_scene_was_kept(clock):
     pace = Pace()
     pace.rate(Event("reconstruct", 1, 1, {"kept": 1.0}))

@@ -503,6 +503,15 @@ def test_a_prompt_is_encoded_once_and_cached_on_disk(tmp_path):
     torch.testing.assert_close(TextCache(tmp_path).encode("color", prompts, never), found)
 
 
+def test_the_file_of_a_scene_does_not_depend_on_what_the_users_cache_knew(tmp_path):
+    TextCache(tmp_path / "user").encode("color", ["blue vase"], ColorEncoder)
+    for scene, user in (("a", "user"), ("b", "empty")):
+        cache = TextCache(tmp_path / scene, tmp_path / user)
+        cache.encode("color", ["red apple", "blue vase", "green box"], ColorEncoder)
+    one, other = (next((tmp_path / scene).iterdir()).read_bytes() for scene in "ab")
+    assert one == other
+
+
 def test_texts_are_encoded_one_by_one_and_the_cache_is_written_once(tmp_path, monkeypatch):
     """In a batch, the last bits of an embedding depend on the other texts."""
     batches, written = [], []

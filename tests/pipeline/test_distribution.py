@@ -4,8 +4,11 @@ import contextlib
 import dataclasses
 import functools
 import json
+import logging
 import os
 import shutil
+import time
+import types
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -23,10 +26,11 @@ from lexsplat.captures import Capture, load_capture
 from lexsplat.features import FeatureMap, FeatureMaps, extract_features
 from lexsplat.language.methods.averaged import AveragedConfig
 from lexsplat.language.methods.averaging import MOST_SHARDS, SHARD_VIEWS, average_features, view_shards
-from lexsplat.pipeline import build, distribution
+from lexsplat.pipeline import build, distribution, scene_progress
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.distribution import extract_on_workers, scene_tasks
 from lexsplat.runtime.errors import CaptureError, LexsplatError, WorkersError
+from lexsplat.runtime.progress import Event
 from lexsplat.runtime.workers import ANY_MACHINE, IN_PROCESS, InProcess, SharedFolder
 
 CONFIG = BuildConfig(device="cpu", encoder_device="cpu")
@@ -234,12 +238,14 @@ def test_what_killed_commands_left_is_removed_when_it_serves_no_more(tiny_captur
     output = tmp_path / "scene"
     left = output / "checkpoints" / "blocks" / "0-00018.safetensors"
     mark = output / "checkpoints" / "features" / ".workers-0"
-    for path in (left, mark):
-        path.parent.mkdir(parents=True)
+    above = output / "checkpoints" / ".workers-1"
+    for path in (left, mark, above):
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     assert cli.main(["reconstruct", str(tiny_capture), "--output", str(output), *QUICK_BUILD]) == 0
     assert not left.parent.exists()
     assert not mark.exists()
+    assert not above.exists()
 
 
 def test_two_captures_of_one_name_are_refused(tmp_path):
@@ -249,6 +255,42 @@ def test_two_captures_of_one_name_are_refused(tmp_path):
     tasks = scene_tasks({tmp_path / "room": dataclasses.replace(CONFIG, workers="ray")}, tmp_path / "scenes")
     assert tasks["room"].config.workers == "none"
     assert tasks["room"].output == tmp_path / "scenes" / "room"
+
+
+class FromAnotherProcess(InProcess):
+    """Workers that do not share the listener, as those of Ray; they wait until their event was read."""
+
+    distributed = True
+
+
+@pytest.mark.parametrize("workers", [IN_PROCESS, FromAnotherProcess()], ids=["in process", "workers"])
+def test_events_and_warnings_of_scenes_carry_their_names(workers, tmp_path, monkeypatch, caplog):
+    def build_one(source, output, config, until, listener):
+        if source.name == "attic":
+            raise CaptureError(source, expected="photos", found="none")
+        logging.getLogger("lexsplat").warning("%d photos are dark", 3)
+        listener(Event("features", 1, 9))
+        wanted = time.monotonic() + 20
+        while workers.distributed and not any(event.stage == "features" for event in events):
+            assert time.monotonic() < wanted
+            time.sleep(0.05)
+        return types.SimpleNamespace(record={"stages": ["features"]})
+
+    events: list[Event] = []
+    monkeypatch.setattr(build, "build", build_one)
+    monkeypatch.setattr(scene_progress, "_READ_SECONDS", 0.05)
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / ".progress-attic.json").write_text('["left", 1, 2, {}]')
+    tasks = scene_tasks({tmp_path / name: CONFIG for name in ("attic", "bath")}, tmp_path / "scenes")
+    list(distribution.build_scenes(tasks, tmp_path / "scenes", workers, events.append))
+    assert [(event.scene, event.stage, event.done) for event in events] == [
+        ("", "scenes", 0), ("attic", "failed", 1), ("", "scenes", 1),
+        ("bath", "features", 1), ("bath", "finished", 1), ("", "scenes", 2),
+    ]  # fmt: skip
+    assert events[-1].metrics["failed"] == 1
+    assert list((tmp_path / "scenes").iterdir()) == []
+    if not workers.distributed:  # those of workers are named by the engine
+        assert caplog.messages == ["bath: 3 photos are dark"]
 
 
 @pytest.mark.slow
@@ -263,7 +305,7 @@ def test_many_captures_make_many_scenes_and_one_that_fails_is_told(tiny_capture,
     assert "error: " in said.err
     assert "expected 3 scenes, found 1 failed, listed above" in said.err
     assert "attic: " in said.err
-    assert "features: " in said.err, "the stages of each scene are shown, not only the number of scenes"
+    assert "bath: features: " in said.err, "the stages of each scene are shown, not only the number of scenes"
     assert "scenes: 0/3" in said.err
     for name in ("bath", "kitchen"):
         assert (tmp_path / "scenes" / name / "language.safetensors").exists()

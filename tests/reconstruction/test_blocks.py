@@ -462,7 +462,10 @@ def rolled(capture, folder):
 @pytest.mark.parametrize(
     ("count", "message"),
     [
-        ("200", r"error: block \d+ of 200: expected points, .*; give a smaller --blocks, .*"),
+        (
+            "200",
+            r"error: --blocks 200: expected at least 400 training views, found \d+; give a smaller --blocks, .*",
+        ),
         ("2", r"error: --blocks: expected a ground plane, .*; give --up X,Y,Z or --blocks none"),
     ],
 )

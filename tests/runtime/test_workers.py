@@ -1,5 +1,6 @@
 """Workers: one map with results in order, in this process and on a real Ray whose nodes are killed."""
 
+import contextlib
 import os
 import random
 import socket
@@ -111,6 +112,36 @@ def test_an_object_store_that_is_too_small_is_told_with_the_room_that_all_result
     assert found.startswith("object store of Ray: expected room for 4 results of 30MB, found 76MB; start")
 
 
+def test_the_memory_to_give_leaves_out_what_no_budget_makes_smaller(monkeypatch):
+    most = [2670 << 20]
+    monkeypatch.setattr(ray_tasks, "_most_memory", lambda: most[0])
+    needs = Needs(memory=5632 << 20, libraries=1536 << 20)
+    assert str(ray_tasks.no_node(needs)).endswith(
+        "found at most 2670MB; use --memory 567MB, or use larger nodes; finished work is kept"
+    )
+    assert 567 + 1536 < 2670
+    most[0] = 1600 << 20
+    assert str(ray_tasks.no_node(needs)).endswith(
+        "found at most 1600MB; use larger nodes; finished work is kept"
+    )
+
+
+@pytest.mark.parametrize("answer", [b"", b"SSH-2.0-OpenSSH_9.2\r\n", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
+def test_an_address_where_another_server_answers_is_refused_at_once_with_the_ports_of_ray(answer):
+    def reply():
+        connected, _ = listening.accept()
+        with connected, contextlib.suppress(OSError):  # the other side may close first
+            connected.sendall(answer)
+            connected.shutdown(socket.SHUT_WR)
+            while connected.recv(100):
+                pass
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=reply, daemon=True).start()
+        with pytest.raises(WorkersError, match=r"found a server that is not Ray's; .*HOST:6379, .*10001"):
+            ray_connection._greet("127.0.0.1:1", "127.0.0.1", listening.getsockname()[1])
+
+
 def test_a_server_of_the_client_that_did_not_start_in_time_is_asked_once_more(monkeypatch):
     tried = []
 
@@ -122,8 +153,8 @@ def test_a_server_of_the_client_that_did_not_start_in_time_is_asked_once_more(mo
             )
 
     monkeypatch.setitem(sys.modules, "ray", types.SimpleNamespace(init=init))
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        ray_connection.connect(f"ray://127.0.0.1:{listening.getsockname()[1]}")
+    monkeypatch.setattr(ray_connection, "_greet", lambda *_: None)
+    ray_connection.connect("ray://head:10001")
     assert len(tried) == 2
 
 
@@ -311,14 +342,15 @@ def test_a_cluster_that_disappears_ends_in_one_line(tmp_path):
     try:
         script = (
             "from support import two_nodes; from lexsplat.runtime.workers import open_workers\n"
-            "from lexsplat.runtime.errors import WorkersError\n"
-            "try:\n"
+            "from lexsplat import cli\n"
+            "def run(words):\n"
             "    with open_workers('ray') as workers:\n"
             "        print('connected', flush=True)\n"
             "        list(workers.map(two_nodes.late_first, None, {'a': 1}))\n"
             "        ones, items = __import__('numpy').ones(9), {str(i): i for i in range(999)}\n"
             "        list(workers.map(two_nodes.slow_sum, ones, items))\n"
-            "except WorkersError as error: print(error, flush=True)\n"
+            "cli._run = run\n"
+            "raise SystemExit(cli.main([]))\n"
         )
         environment = {**os.environ, "RAY_ADDRESS": started.address}
         driver = subprocess.Popen(
@@ -333,5 +365,6 @@ def test_a_cluster_that_disappears_ends_in_one_line(tmp_path):
         time.sleep(2)
         started.cluster.head_node.kill_all_processes(check_alive=False, allow_graceful=False)
         assert "finished work is kept; run the same command again" in driver.communicate(timeout=120)[0]
+        assert driver.returncode == 1, "no crash in what is left of Ray"
     finally:
         started.stop()

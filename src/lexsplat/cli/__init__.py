@@ -73,7 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()  # here, so that a reader that has ended is noticed below
         return status
     except LexsplatError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        if error.crashes_at_exit:
+            sys.stdout.flush()
+            os._exit(1)
     except KeyboardInterrupt:
         print(STOPPED, file=sys.stderr)
         return 130  # as shells report Ctrl-C

@@ -26,6 +26,8 @@ from rich.text import Text
 from lexsplat.runtime.progress import Event, Listener, Pace
 
 _SECONDS_BETWEEN_LINES = 15.0
+_ENDS = ("finished", "failed")
+"""Stages by which events say that a scene of several has ended."""
 
 
 class _RateColumn(ProgressColumn):
@@ -61,7 +63,7 @@ class ProgressBars:
         self._pace = Pace()
         self._last_line: dict[str, float] = {}
         self._progress = Progress(
-            TextColumn("{task.description:<13}"),
+            TextColumn("{task.description:<13}", markup=False),
             BarColumn(bar_width=24),
             MofNCompleteColumn(),
             _RateColumn(),
@@ -88,27 +90,37 @@ class ProgressBars:
         text = "kept from the last run" if kept else numbers
         if self.console.is_terminal:
             self._draw(event, text)
-        else:
+        elif not (event.scene and event.stage in _ENDS):
             self._print_line(event, text)
 
     def _draw(self, event: Event, text: str) -> None:
-        if event.stage not in self._tasks:
-            self._tasks[event.stage] = self._progress.add_task(event.stage, total=event.total, metrics="")
-        if event.done < self._progress.tasks[self._tasks[event.stage]].completed:  # that of the next scene
-            self._progress.reset(self._tasks[event.stage])
-        self._progress.update(self._tasks[event.stage], completed=event.done, total=event.total, metrics=text)
+        """A bar for each stage; of several scenes, a bar for each scene under way, with its present stage."""
+        if event.scene and event.stage in _ENDS:
+            if event.scene in self._tasks:
+                self._progress.remove_task(self._tasks.pop(event.scene))
+            return
+        key, title = (event.scene, f"{event.scene}: {event.stage}") if event.scene else (event.stage,) * 2
+        if key not in self._tasks:
+            self._tasks[key] = self._progress.add_task(title, total=event.total, metrics="")
+        task = next(task for task in self._progress.tasks if task.id == self._tasks[key])
+        if (
+            event.done < task.completed or task.description != title
+        ):  # the stage starts anew, or the next one does
+            self._progress.reset(task.id, description=title)
+        self._progress.update(task.id, completed=event.done, total=event.total, metrics=text)
 
     def _print_line(self, event: Event, text: str) -> None:
         now, rate = time.monotonic(), self._pace.rate(event)
-        is_first = event.stage not in self._last_line
-        is_due = now - self._last_line.get(event.stage, 0.0) >= _SECONDS_BETWEEN_LINES
+        name = f"{event.scene}: {event.stage}" if event.scene else event.stage
+        is_first = name not in self._last_line
+        is_due = now - self._last_line.get(name, 0.0) >= _SECONDS_BETWEEN_LINES
         if not (is_first or is_due or event.done >= event.total):
             return
-        self._last_line[event.stage] = now
+        self._last_line[name] = now
         speed = format_rate(rate)
         if rate and event.done < event.total:
             speed += f", {format_seconds((event.total - event.done) / rate)} left"
-        parts = (f"{event.stage}: {event.done}/{event.total}", speed, text)
+        parts = (f"{name}: {event.done}/{event.total}", speed, text)
         self.console.print(" ".join(part for part in parts if part), highlight=False, soft_wrap=True)
 
 

@@ -120,8 +120,11 @@ class TextCache:
             if any(len(vector) != vectors.shape[1] for vector in found.values()):
                 new, vectors = wanted, encode_each(model, wanted, listener)
             found.update(zip(new, vectors))
+        in_order = {
+            prompt: found[prompt] for prompt in wanted
+        }  # so that files do not depend on what was known
         for store in self._written:
-            store.add(content_hash, found)
+            store.add(content_hash, in_order)
         return torch.stack([found[prompt] for prompt in prompts])
 
 

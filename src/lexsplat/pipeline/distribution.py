@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import threading
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from lexsplat.features.extraction import missing_views
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.encoding import Encoders
 from lexsplat.pipeline.provenance import with_full_paths
+from lexsplat.pipeline.scene_progress import LastEvent, named, named_messages, relayed
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.memory import parse_bytes
@@ -124,10 +127,10 @@ class SceneTask:
 
 @dataclass(frozen=True)
 class _Scenes:
-    """What all scenes share: the output folder and the listener of progress events."""
+    """What all scenes share: the output folder, and in this process the listener of progress events."""
 
     folder: SharedFolder
-    listener: Listener
+    listener: Listener | None
 
 
 def scene_tasks(
@@ -162,7 +165,9 @@ def build_scenes(
         tasks: From `scene_tasks`.
         output: Folder of all scenes, which every worker must see.
         workers: Where they run.
-        listener: Receives an event of stage "scenes" after every scene; in this process, those of its stages too.
+        listener: Receives an event of stage "scenes" after every scene, and one of stage "finished" or "failed" with
+            its name. Of scenes under way it receives the events of their stages: in this process all, of workers the
+            last one of every second.
 
     Yields:
         The outcomes in the order of the tasks.
@@ -171,21 +176,34 @@ def build_scenes(
         WorkersError: If a worker does not see the output.
     """
     memory = max((parse_bytes(task.config.memory) for task in tasks.values()), default=0)
-    needs = Needs(memory=memory + LIBRARIES_BYTES, gpu=any(t.config.device != "cpu" for t in tasks.values()))
+    on_gpu = any(task.config.device != "cpu" for task in tasks.values())
+    needs = Needs(memory=memory + LIBRARIES_BYTES, libraries=LIBRARIES_BYTES, gpu=on_gpu)
     with SharedFolder.offered(output) as folder:
         if not workers.see(folder):
             raise folder.unseen()
-        listener(Event("scenes", 0, len(tasks)))
-        shared = _Scenes(folder, silent if workers.distributed else listener)
-        for done, outcome in enumerate(workers.map(_build_scene, shared, tasks, needs), start=1):
-            yield outcome
-            listener(Event("scenes", done, len(tasks), workers.metrics))
+        lock, failed = threading.Lock(), 0
+
+        def send(event: Event) -> None:
+            with lock:  # events of workers come from another thread
+                listener(event)
+
+        send(Event("scenes", 0, len(tasks)))
+        shared = _Scenes(folder, None if workers.distributed else send)
+        with relayed(folder.path, tasks, send) as forget:
+            for done, outcome in enumerate(workers.map(_build_scene, shared, tasks, needs), start=1):
+                forget(outcome.name)
+                failed += outcome.error is not None
+                send(Event("finished" if outcome.error is None else "failed", 1, 1, scene=outcome.name))
+                yield outcome
+                send(Event("scenes", done, len(tasks), {**workers.metrics, "failed": failed}))
 
 
 def _build_scene(shared: _Scenes, task: SceneTask) -> list[str]:
     """Build a scene; returns the names of its stages."""
     from lexsplat.pipeline.build import build
 
-    with shared.folder.opened(None):
-        built = build(task.source, task.output, task.config, until=task.until, listener=shared.listener)
+    name, here = task.output.name, shared.listener
+    with shared.folder.opened(None) as folder, nullcontext() if here is None else named_messages(name):
+        listener = LastEvent(folder, name) if here is None else named(name, here)
+        built = build(task.source, task.output, task.config, until=task.until, listener=listener)
     return list(built.record["stages"])

@@ -21,7 +21,6 @@ from lexsplat.captures.sfm.triangulation import initial_points
 from lexsplat.geometry.gaussians import TENSORS, Gaussians
 from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.reconstruction.several_gpus import PartReconstructor
-from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import BackendError, LexsplatError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.scenes.formats.ply import write_ply
@@ -84,7 +83,11 @@ def main() -> None:
                 found=f"no {min(missing)}",
                 remedy="run: torchrun --nproc-per-node 4 -m lexsplat.pipeline.several_gpus CAPTURE --output FILE",
             )
-        choose_device("cuda")
+        if not torch.cuda.is_available():
+            remedy = "reconstruct in one process: lexsplat reconstruct CAPTURE --output SCENE"
+            raise BackendError(
+                "several GPUs", expected="a CUDA GPU for each process", found="none", remedy=remedy
+            )
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
         distributed.init_process_group("nccl")
         reconstruct_together(given.capture, given.output, config, given.seed)

@@ -227,6 +227,13 @@ def cut_blocks(
         CaptureError: If a cell has no points, if too few views show it, or if there are too few views.
     """
     views = capture.train_views
+    if len(views) < 2 * count:
+        raise CaptureError(
+            f"--blocks {count}",
+            expected=f"at least {2 * count} training views",
+            found=str(len(views)),
+            remedy="give a smaller --blocks, or more --memory where --blocks is auto",
+        )
     cells = tuple(Cell(*ends) for ends in _cut(points @ axes.T, count))
     homes = _cells_of(points, cells, axes)
     some = np.arange(len(points))
@@ -236,11 +243,11 @@ def cut_blocks(
     shares = np.array([_shares(view, *looked_at, count) for view in views]).reshape(len(views), count)
     for number in range(count):
         own, shown = int((homes == number).sum()), int((shares[:, number] > 0).sum())
-        if shown < _FEWEST_VIEWS or not own or len(views) < 2 * count:
+        if shown < _FEWEST_VIEWS or not own:
             raise CaptureError(
                 f"block {number + 1} of {count}",
                 expected=f"points, and at least {_FEWEST_VIEWS} views that show them",
-                found=f"{own:,} points and {min(shown, len(views) // count)} views",
+                found=f"{own:,} points and {shown} views",
                 remedy="give a smaller --blocks, or more --memory where --blocks is auto",
             )
     groups = _groups(np.array([view.camera.position @ axes.T for view in views]), count)

@@ -18,7 +18,13 @@ class LexsplatError(Exception):
         expected: A valid content or value.
         found: The actual content or value.
         remedy: What the user can do.
+
+    Attributes:
+        crashes_at_exit: Whether what is left in the process would crash at its exit, so that the command line ends it
+            at once.
     """
+
+    crashes_at_exit = False
 
     def __init__(self, subject: object, *, expected: str = "", found: str = "", remedy: str = "") -> None:
         self.subject = str(subject)

@@ -24,37 +24,42 @@ class Event:
         done: Finished units.
         total: All units.
         metrics: Numbers to show beside the bar, such as ``{"psnr": 31.2}``.
+        scene: Name of the scene that the stage is of, where several are built.
     """
 
     stage: str
     done: int
     total: int
     metrics: Mapping[str, float] = field(default_factory=dict)
+    scene: str = ""
 
 
 Listener = Callable[[Event], None]
 """Receives events. It must return quickly and never raise."""
 
 
+_Key = tuple[str, str]
+"""Scene and stage."""
+
+
 class Pace:
     """Rates and times left of stages, from their events."""
 
     def __init__(self) -> None:
-        self._starts: dict[str, tuple[float, int]] = {}  # time and units done at the first event of a stage
-        self._done: dict[str, int] = {}
-        self._ended: set[str] = set()
+        self._starts: dict[_Key, tuple[float, int]] = {}  # time and units done at the first event of a stage
+        self._done: dict[_Key, int] = {}
+        self._ended: set[_Key] = set()
 
     def rate(self, event: Event) -> float:
-        """Units a second since the first event of the stage; 0 at that event. The next scene starts a stage anew."""
-        now = time.monotonic()
-        before = self._done.get(event.stage, 0)
-        if event.done < before or event.stage in self._ended:
-            del self._starts[event.stage]
-        self._ended.discard(event.stage)
+        """Units a second since the first event of the stage; 0 at that event. A stage can start anew."""
+        now, key = time.monotonic(), (event.scene, event.stage)
+        if event.done < self._done.get(key, 0) or key in self._ended:
+            del self._starts[key]
+        self._ended.discard(key)
         if event.done >= event.total:
-            self._ended.add(event.stage)
-        self._done[event.stage] = event.done
-        started, done_before = self._starts.setdefault(event.stage, (now, event.done))
+            self._ended.add(key)
+        self._done[key] = event.done
+        started, done_before = self._starts.setdefault(key, (now, event.done))
         return (event.done - done_before) / (now - started) if now > started else 0.0
 
     def record(self, event: Event) -> dict[str, Any]:
@@ -63,6 +68,7 @@ class Pace:
         left = (event.total - event.done) / rate if rate else None
         numbers = {name: value if math.isfinite(value) else None for name, value in event.metrics.items()}
         return {
+            "scene": event.scene or None,
             "stage": event.stage,
             "done": event.done,
             "total": event.total,

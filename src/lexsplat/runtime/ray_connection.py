@@ -10,6 +10,10 @@ from typing import Any
 from lexsplat.runtime.errors import WorkersError
 
 _WAIT_SECONDS = 5.0
+_SETTINGS = b"\0\0\0\4\0\0\0\0\0"
+"""An empty frame of settings (RFC 9113, sections 4.1 and 6.5)."""
+_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + _SETTINGS
+_PORTS = "check the address (RAY_ADDRESS is HOST:6379, the --port of ray start; ray:// takes its client port, 10001)"
 _TOKEN = "; if the cluster was started with a token, set RAY_AUTH_MODE=token and copy ~/.ray/auth_token from its head"
 
 
@@ -27,13 +31,10 @@ def connect(place: str, tries: int = 2) -> None:
 
     host, _, port = place.removeprefix("ray://").rpartition(":")
     named = bool(host) and port.isdigit()
+    if named:  # Ray tries for a minute where nothing listens, and for hours where something else does
+        _greet(place, host, int(port))
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
     own: dict[str, Any] = {"include_dashboard": False} if place == "local" else {}
-    try:
-        if named:  # Ray tries for a minute where nothing listens
-            socket.create_connection((host, int(port)), timeout=_WAIT_SECONDS).close()
-    except OSError as error:
-        raise _unreachable(place, error) from error
     try:
         ray.init(address=place, **quiet, **own)
     except (ConnectionError, RuntimeError, ValueError, TimeoutError, OSError) as error:
@@ -41,6 +42,22 @@ def connect(place: str, tries: int = 2) -> None:
             connect(place, tries - 1)
             return
         raise _unreachable(place, error, answers=named) from error
+
+
+def _greet(place: str, host: str, port: int) -> None:
+    """Check that a server of gRPC listens, as those of Ray are: it answers the preface of HTTP/2 with its settings.
+
+    Raises:
+        WorkersError: If nothing or something else listens.
+    """
+    try:
+        with socket.create_connection((host, port), timeout=_WAIT_SECONDS) as server:
+            server.sendall(_PREFACE)
+            answer = server.recv(len(_SETTINGS), socket.MSG_WAITALL)
+    except OSError as error:
+        raise _unreachable(place, error) from error
+    if answer[3:4] != _SETTINGS[3:4]:  # the kind of the frame, after three bytes of its length
+        raise _unreachable(place, ConnectionError("a server that is not Ray's"))
 
 
 class OwnRay:
@@ -98,5 +115,5 @@ def _unreachable(place: str, error: Exception, *, answers: bool = False) -> Work
         f"Ray at {place}",
         expected="a running cluster",
         found=reason or type(error).__name__,
-        remedy="check the address and: ray status" + (_TOKEN if answers else ""),
+        remedy=f"{_PORTS} and: ray status" + (_TOKEN if answers else ""),
     )

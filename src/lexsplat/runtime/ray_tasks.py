@@ -24,6 +24,8 @@ _WAIT_SECONDS = 5.0
 _NODES_SECONDS = 30.0
 _WITHOUT_NODES_SECONDS = 60.0
 """Seconds without a node that can hold a task, after which no more is waited for one."""
+_LEAST_MEMORY = 64 << 20
+"""Smallest budget worth a try."""
 _HELD = 16
 """Results a slot that may wait for an earlier one, where the size of a result is not known."""
 
@@ -210,11 +212,13 @@ def no_node(needs: Needs) -> WorkersError:
     most = _most_memory()
     if needs.memory <= most:
         return ClusterLostError.by()
+    room = (most - needs.libraries) // 2  # Ray counts what other programs take as free
+    smaller = f"use --memory {size_text(room)}, or " if room >= _LEAST_MEMORY else ""
     return WorkersError(
         "--workers",
         expected=f"a node with {size_text(needs.memory, up=True)} of memory for a task",
         found=f"at most {size_text(most)}",
-        remedy=f"use --memory {size_text(max(1 << 20, most // 2))}, or larger nodes; finished work is kept",
+        remedy=f"{smaller}use larger nodes; finished work is kept",
     )
 
 

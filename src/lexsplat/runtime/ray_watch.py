@@ -30,6 +30,8 @@ BLOCKED_SECONDS = 15.0
 class ClusterLostError(WorkersError):
     """The cluster has disappeared."""
 
+    crashes_at_exit = True  # in threads of Ray that still look for it
+
     @classmethod
     def by(cls, error: Exception | None = None) -> ClusterLostError:
         """The error to raise, of what Ray raised if it did."""

@@ -30,11 +30,13 @@ class Needs:
 
     Args:
         memory: Host memory in bytes; 0 leaves it to the engine.
+        libraries: The part of it that no budget makes smaller.
         gpu: Whether it computes on a GPU, of which it then gets one of its own.
         result: Size of its result in bytes, if it may be large.
     """
 
     memory: int = 0
+    libraries: int = 0
     gpu: bool = False
     result: int = 0
 
@@ -238,8 +240,8 @@ class SharedFolder:
 
     @staticmethod
     def forget_marks(root: Path) -> None:
-        """Remove the marks that killed commands left in the folders below ``root``, which only this process uses."""
-        for mark in root.glob("*/.workers-*"):
+        """Remove the marks that killed commands left in ``root`` and its folders, which only this process uses."""
+        for mark in (*root.glob(".workers-*"), *root.glob("*/.workers-*")):
             mark.unlink(missing_ok=True)
 
     @property
