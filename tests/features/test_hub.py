@@ -212,3 +212,21 @@ def test_a_repository_without_a_needed_file_is_refused_before_the_download(fake,
     fake.files |= {"open_clip_config.json": 7}
     refused(told)
     assert not fake.fetched
+
+
+def test_a_file_is_refused_with_its_folder_and_a_path_that_is_not_there_without_the_network(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(hub, "_download", lambda *_: pytest.fail("the network is asked"))
+    weights = tmp_path / "clip" / "model.safetensors"
+    weights.parent.mkdir()
+    weights.touch()
+    with pytest.raises(
+        ModelError, match=f"expected a model folder, found a file; give its folder: --clip {weights.parent}$"
+    ):
+        hub.model_folder(str(weights), "clip")
+    for name in (tmp_path / "nowhere", "./nowhere", "~/no where", "models/clip/large"):
+        with pytest.raises(
+            ModelError, match="expected a model folder, or a name OWNER/NAME, found no such folder"
+        ):
+            hub.model_folder(str(name), "dino")

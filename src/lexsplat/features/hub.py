@@ -69,6 +69,12 @@ def model_folder(name: str, tower: str) -> Path:
                 remedy=_remedy_for(lacking, name, tower),
             )
         return folder
+    if folder.exists():
+        remedy = f"give its folder: --{tower} {folder.parent}"
+        raise ModelError(name, expected="a model folder", found="a file", remedy=remedy)
+    if len(folder.parts) > 2 or name.startswith((".", "~")):  # names on the hub are OWNER/NAME
+        expected = "a model folder, or a name OWNER/NAME"
+        raise ModelError(name, expected=expected, found="no such folder", remedy=_choices(tower))
     cached, lacking = _cached_folder(name, tower)
     return cached if cached is not None else _download(name, tower, lacking)
 
