@@ -197,8 +197,8 @@ def test_two_libraries_share_a_server_and_stay_apart(rooms, chroma, tmp_path):
     assert hits(second, "mug") == []
 
 
-def test_the_server_recalls_the_ten_best_of_two_thousand_mixed_scenes(chroma, tmp_path):
-    library = mixed_library(tmp_path / "library", 2000, 8, 64)
+def test_the_server_recalls_the_ten_best_of_five_hundred_mixed_scenes(chroma, tmp_path):
+    library = mixed_library(tmp_path / "library", 500, 8, 64)
     served = Library(library.root, index=chroma.url)
     served.encode = library.encode
     served.server.repair([(record, served.codes(record)) for record in served.records()], served.stage)
