@@ -203,6 +203,7 @@ def test_the_wrong_color_is_less_relevant_at_a_thing(judge):
     [
         ("mug handle", True), ("bear nose", True), ("bottle cap", True), ("mug", False), ("red mug", False),
         ("stack of books", False), ("table lamp", False), ("mug red", False), ("something to drink from", False),
+        ("toy car wheels", True), ("car wheel", True), ("wheel", False),
     ],
 )  # fmt: skip
 def test_a_part_is_named_behind_its_thing(phrase, part):
@@ -213,7 +214,7 @@ def test_a_part_is_named_behind_its_thing(phrase, part):
     ("phrase", "thing"),
     [
         ("mug handle", "mug"), ("Red mug handles", "red mug"), ("teddy bear nose", "teddy bear"),
-        ("table leg", "table"),
+        ("table leg", "table"), ("toy car wheels", "toy car"), ("bear belly", "bear"), ("apple stalk", "apple"),
         ("candle holder", ""), ("phone charger", ""), ("nose", ""), ("big nose", ""), ("table lamp", ""), ("", ""),
     ],
 )  # fmt: skip

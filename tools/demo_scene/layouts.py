@@ -1,4 +1,4 @@
-"""The layouts of the two demo scenes: objects, camera paths and prompts."""
+"""The layouts of the two demo scenes and of a scene of parts: objects, camera paths and prompts."""
 
 from __future__ import annotations
 
@@ -234,4 +234,59 @@ SECOND = Layout(
     },
 )
 
-LAYOUTS = {"tabletop": TABLETOP, "second": SECOND}
+PARTS = Layout(
+    seed=23,
+    width=320,
+    height=240,
+    views=30,
+    test_every=5,
+    field_of_view=46,
+    path=CameraPath(
+        sweeps=((20, 27), (38, 33)),
+        half_arc=40,
+        distance=4.3,
+        distance_swing=0.3,
+        target=(0, 0.0, 0.25),
+        target_swing=0.1,
+    ),
+    placements=(
+        Placement("plant", "green", -1.15, 0.65, 0.3, 1.05),
+        Placement("lamp", "yellow", 1.2, 0.75, 0.0, 1.0),
+        Placement("teddy", "pink", 0.1, 0.6, -1.5, 1.15),
+        Placement("mug", "green", 0.75, -0.15, -0.9, 1.0),
+        Placement("duck", "blue", -0.6, -0.05, -1.2, 1.0),
+        Placement("car", "yellow", -1.1, -0.65, -0.7, 1.0),
+        Placement("bottle", "brown", -0.55, 0.85, 0.0, 1.05),
+        Placement("pumpkin", "orange", 0.2, -0.75, 0.5, 0.9),
+        Placement("candle", "white", 1.25, -0.55, 0.0, 1.05),
+    ),
+    cloth=("green", 0.1, -0.2, 0.35),
+    wall=("blue", "plain"),
+    key_light=(-1.5, 500, 2.0),
+    fill_watts=110,
+    sky=0.3,
+    prompts={
+        "mug handle": Prompt("part", ("mug.handle",)),
+        "bear nose": Prompt("part", ("teddy.nose",)),
+        "bear ears": Prompt("part", ("teddy.ears",)),
+        "bear belly": Prompt("part", ("teddy.belly",)),
+        "duck beak": Prompt("part", ("duck.beak",)),
+        "plant pot": Prompt("part", ("plant.pot",)),
+        "lamp shade": Prompt("part", ("lamp.shade",)),
+        "lamp stand": Prompt("part", ("lamp.stand",)),
+        "bottle cork": Prompt("part", ("bottle.cork",)),
+        "pumpkin stalk": Prompt("part", ("pumpkin.stalk",)),
+        "car wheels": Prompt("part", ("car.wheels",)),
+        "candle flame": Prompt("part", ("candle.flame",)),
+        "candle saucer": Prompt("part", ("candle.saucer",)),
+        "green mug": Prompt("color", ("mug",)),
+        "rubber duck": Prompt("name", ("duck",)),
+        "teddy bear": Prompt("name", ("teddy",)),
+        "toy car": Prompt("name", ("car",)),
+        "table lamp": Prompt("name", ("lamp",)),
+    },
+)
+"""Not bundled: questions for parts of things."""
+
+LAYOUTS = {"tabletop": TABLETOP, "second": SECOND, "parts": PARTS}
+BUNDLED = ("tabletop", "second")

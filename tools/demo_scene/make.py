@@ -7,7 +7,7 @@ import os
 import sys
 from pathlib import Path
 
-from layouts import LAYOUTS
+from layouts import BUNDLED, LAYOUTS
 from quiet import quiet_output
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -16,7 +16,7 @@ CAPTURES = REPOSITORY / "src" / "lexsplat" / "demo" / "captures"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", nargs="+", choices=LAYOUTS, default=list(LAYOUTS))
+    parser.add_argument("--scenes", nargs="+", choices=LAYOUTS, default=list(BUNDLED))
     parser.add_argument("--steps", nargs="+", choices=("render", "pack"), default=["render", "pack"])
     parser.add_argument("--work", type=Path, default=REPOSITORY / "output" / "demo_scene", help="work folder")
     parser.add_argument("--output", type=Path, default=CAPTURES, help="folder that gets one folder a scene")

@@ -27,8 +27,9 @@ _QUALITIES = """
     transparent, colorful, dirty, clean
 """
 _PARTS = """
-    handle, lid, cap, spout, neck, rim, knob, stem, leaf, petal, shade, cord, string, flame, wick, spine, page,
-    button, sole, lace, wing, beak, nose, ear, eye, mouth, tail, paw, foot, leg, arm
+    handle, lid, cap, spout, neck, rim, knob, stem, stalk, leaf, petal, shade, cord, string, flame, wick, cork,
+    spine, page, button, sole, lace, wheel, tire, roof, wing, beak, head, face, nose, ear, eye, mouth, tail, belly, paw,
+    foot, leg, arm
 """
 _SURFACES = """
     table, tablecloth, desk, cloth, wall, floor, ceiling, carpet, grass, road, sky, water, sand, stairs, wood, metal,
@@ -66,7 +67,7 @@ def has_color(phrase: str) -> bool:
 def is_part(phrase: str) -> bool:
     """Whether a phrase names a part of a thing: the everyday name of the thing, and then another word."""
     *before, last = (word.removesuffix("s") for word in phrase.lower().split() or [""])
-    return last not in NAMES | QUALITIES and not NAMES.isdisjoint(before)
+    return (last in PARTS or last not in NAMES | QUALITIES) and not NAMES.isdisjoint(before)
 
 
 def thing_of_part(phrase: str) -> str:

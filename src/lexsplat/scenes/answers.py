@@ -17,13 +17,14 @@ from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.grammar import understand, undetermined
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.kinds import is_kind, is_of_kind
+from lexsplat.queries.parts import FEWEST, part_scores
 from lexsplat.queries.relevancy import check_prompts, render_relevancy
 from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
 from lexsplat.queries.spelling import singular
 from lexsplat.queries.thresholds import BORDER, scene_thresholds
 from lexsplat.queries.visibility import without_hidden
-from lexsplat.queries.vocabulary import STUFF
+from lexsplat.queries.vocabulary import STUFF, thing_of_part
 from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.progress import Event
@@ -170,6 +171,18 @@ def of_kind(scene: Scene, prompt: str, word: Word) -> Word:
     # What is no member stays below the border, and what is a member reaches it.
     inside, outside = word.scores.clamp(min=BORDER), word.scores.clamp(max=BORDER - 1e-4)
     return replace(word, scores=torch.where(taken, inside, outside), presence="yes")
+
+
+def of_part(scene: Scene, prompt: str, word: Word) -> Word:
+    """The word as it is, or cut within its thing if it names a part of one (`lexsplat.queries.parts`)."""
+    name, segments = thing_of_part(prompt), scene.field.segments
+    if not name or word.presence == "no" or form_used(scene.field, scene.query) != "segment" or not segments:
+        return word
+    found = scene.ask(name)
+    thing = found.chosen(0)
+    if found.presences[0] == "no" or int(thing.sum()) < FEWEST:
+        return word
+    return replace(word, scores=part_scores(word.own, thing, scene.gaussians, segments.masses))
 
 
 def answer_queries(

@@ -46,7 +46,7 @@ from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import ModelError, QueryError, SceneFolderError
 from lexsplat.runtime.progress import Listener, silent
-from lexsplat.scenes.answers import Answers, Word, automatic_thresholds, of_kind
+from lexsplat.scenes.answers import Answers, Word, automatic_thresholds, of_kind, of_part
 from lexsplat.scenes.finding import find_in, understood_in
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder, StoredView
 from lexsplat.scenes.kept import kept_objects_of, seen_of
@@ -363,7 +363,7 @@ class Scene:
         formed = scores_in_form(self.field, self.query, scores, presences)
         # Copies: a row would keep the scores of all prompts asked with it.
         words = [Word(row.clone(), own.clone(), here) for row, own, here in zip(formed, scores, presences)]
-        return [of_kind(self, prompt, word) for prompt, word in zip(prompts, words)]
+        return [of_part(self, p, of_kind(self, p, word)) for p, word in zip(prompts, words)]
 
     def _find_thresholds(self, words: Mapping[str, Word]) -> None:
         """The automatic thresholds of words that have none yet."""

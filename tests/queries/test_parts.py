@@ -1,0 +1,105 @@
+from dataclasses import replace
+
+import numpy as np
+import torch
+from support.splats import solid
+
+from lexsplat.geometry.gaussians import SH_C0
+from lexsplat.queries.parts import part_scores
+from lexsplat.queries.segments import SEGMENT_THRESHOLD
+
+BROWN, TAN, BLACK = (0.4, 0.25, 0.1), (0.7, 0.55, 0.35), (0.05, 0.05, 0.05)
+TABLE, HEAD, MUZZLE, NOSE, EARS = range(5)
+
+
+def bear():
+    """Gaussians of a head with a muzzle, a nose on it and two ears, on a table; their places in this list.
+
+    The nose is smaller than any segment, and in the color of nothing around it.
+    """
+    rng = np.random.default_rng(0)
+    table = np.concatenate([rng.uniform(-3, 3, (600, 2)), np.full((600, 1), -1.2)], 1)
+    sphere = rng.normal(size=(3000, 3))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    front, height, side = sphere[:, 0], sphere[:, 2], np.abs(sphere[:, 1])
+    kinds = np.full(3000, HEAD)
+    kinds[front > 0.75] = MUZZLE
+    kinds[front > 0.95] = NOSE
+    kinds[(height > 0.7) & (side > 0.4)] = EARS
+    places = np.concatenate([np.full(600, TABLE), kinds])
+    gaussians = solid(np.concatenate([table, sphere]), -3.0)
+    colors = np.array([TAN, BROWN, TAN, BLACK, BROWN])[places] + rng.normal(0, 0.02, (3600, 3))
+    sh0 = torch.from_numpy((colors - 0.5) / SH_C0).float()[:, None]
+    return replace(gaussians, sh0=sh0), places
+
+
+def taken(scores, gaussians, places, masses=None):
+    """The Gaussians ``[N]`` bool of a part whose relevancies are those of places."""
+    rng = np.random.default_rng(1)
+    own = torch.from_numpy(np.array(scores)[places] + rng.normal(0, 0.02, len(places))).clamp(0, 1).float()
+    masses = torch.ones(len(places)) if masses is None else masses
+    found = part_scores(own, torch.from_numpy(places != TABLE), gaussians, masses)
+    assert 0 <= float(found.min()) <= float(found.max()) <= 1
+    return (found >= SEGMENT_THRESHOLD).numpy()
+
+
+def share(found, wanted) -> float:
+    """Intersection over union of two masks."""
+    return float((found & wanted).sum() / (found | wanted).sum())
+
+
+def test_a_nose_is_cut_out_of_a_muzzle_that_scores_nearly_as_high():
+    gaussians, places = bear()
+    found = taken([0.1, 0.1, 0.75, 0.9, 0.1], gaussians, places)
+    assert share(found, places == NOSE) > 0.9
+
+
+def test_both_ears_are_taken_and_nothing_between_them():
+    gaussians, places = bear()
+    found = taken([0.1, 0.3, 0.1, 0.1, 0.8], gaussians, places)
+    assert share(found, places == EARS) > 0.9
+
+
+def test_a_part_may_be_most_of_its_thing():
+    gaussians, places = bear()
+    found = taken([0.1, 0.9, 0.1, 0.1, 0.9], gaussians, places)
+    assert share(found, (places == HEAD) | (places == EARS)) > 0.9
+
+
+def test_what_lies_outside_the_thing_is_no_part_of_it_however_it_scores():
+    gaussians, places = bear()
+    found = taken([1.0, 0.1, 0.3, 0.9, 0.1], gaussians, places)
+    assert not found[places == TABLE].any()
+    assert share(found, places == NOSE) > 0.9
+
+
+def test_noise_of_single_gaussians_does_not_tear_a_part():
+    gaussians, places = bear()
+    rng = np.random.default_rng(2)
+    own = torch.from_numpy(np.array([0.1, 0.2, 0.2, 0.2, 0.8])[places] + rng.normal(0, 0.2, len(places)))
+    found = part_scores(
+        own.clamp(0, 1).float(), torch.from_numpy(places != TABLE), gaussians, torch.ones(len(places))
+    )
+    alone = own.numpy() >= 0.5
+    ears = places == EARS
+    assert share((found >= SEGMENT_THRESHOLD).numpy(), ears) > share(alone & (places != TABLE), ears) + 0.2
+
+
+def test_gaussians_that_no_view_shows_have_no_say():
+    gaussians, places = bear()
+    masses = torch.ones(len(places))
+    masses[torch.from_numpy(np.flatnonzero(places == NOSE)[::2])] = 0
+    found = taken([0.1, 0.1, 0.75, 0.9, 0.1], gaussians, places, masses)
+    assert share(found, places == NOSE) > 0.85
+    nothing = taken([0.1, 0.1, 0.75, 0.9, 0.1], gaussians, places, torch.zeros(len(places)))
+    assert nothing.shape == places.shape, "also where nothing was shown at all"
+
+
+def test_the_order_of_the_gaussians_does_not_matter():
+    gaussians, places = bear()
+    own = torch.from_numpy(np.array([0.1, 0.1, 0.75, 0.9, 0.1])[places]).float()
+    thing, masses = torch.from_numpy(places != TABLE), torch.ones(len(places))
+    order = torch.randperm(len(places), generator=torch.Generator().manual_seed(3))
+    straight = part_scores(own, thing, gaussians, masses)
+    turned = part_scores(own[order], thing[order], gaussians.select(order), masses)
+    torch.testing.assert_close(turned, straight[order], rtol=1e-4, atol=1e-4)
