@@ -23,6 +23,7 @@ from support.viewer_scene import ball_scene
 from lexsplat.features.encoders import load_clip
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.picking import surface_at
+from lexsplat.queries.vocabulary import thing_of_part
 from lexsplat.rendering import render
 from lexsplat.scenes.publishing import PublishOptions, publish, splat_file, vocabulary
 from lexsplat.scenes.publishing.manifest import checksums
@@ -37,6 +38,8 @@ PROMPTS = (
     "Café's über-mug 42!",  # accents, marks and digits
     "green apple stem",  # judged where its thing is
     "red mug handle",  # of a thing in another color
+    "mug handle",  # cut within the mug
+    "pumpkin stalk",
     "giraffe nose",
     "blue tea mug",  # compared with other things with a color
     "zebra",  # not in the scene
@@ -126,7 +129,14 @@ def test_answers_are_those_of_python(page, demo):
     embeddings = demo.embed(PROMPTS)
     for number, answer in enumerate(found):
         scores = np.frombuffer(base64.b64decode(answer["scores"]), np.float32)
-        assert np.abs(scores - asked.scores[number].numpy()).max() <= 1 / 255, answer["prompt"]
+        expected, near = asked.scores[number].numpy(), 0.02
+        if thing_of_part(answer["phrase"]):  # rounded centers have other neighbors, and a part is stretched to 0..1
+            assert np.quantile(np.abs(scores - expected), 0.999) <= 10 / 255, answer["prompt"]
+            near = 0.05
+            others = ((scores >= 0.5) != (expected >= 0.5)).sum()
+            assert others <= near * (expected >= 0.5).sum(), answer["prompt"]
+        else:
+            assert np.abs(scores - expected).max() <= 1 / 255, answer["prompt"]
         assert answer["presence"] == asked.presences[number], answer["prompt"]
         assert answer["threshold"] == pytest.approx(float(asked.thresholds[number]), abs=0.02), answer[
             "prompt"
@@ -138,7 +148,7 @@ def test_answers_are_those_of_python(page, demo):
         if answer["presence"] == "yes":
             selection = asked.selection(number)
             assert answer["places"] == selection.count, answer["prompt"]
-            assert answer["marked"] == pytest.approx(len(selection), rel=0.02), answer["prompt"]
+            assert answer["marked"] == pytest.approx(len(selection), rel=near), answer["prompt"]
     assert [answer["from"] for answer in found[:3]] == ["dictionary", "dictionary", "text tower"]
     assert [answer["presence"] for answer in found[-2:]] == ["no", "no"]
 
@@ -690,10 +700,17 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_told_in_one_line(browser
             lambda m: m["language"].update(segments="s", segment_rule=None),
             "5 numbers in language.segment_rule",
         ),
+        (
+            lambda m: m["language"].update(
+                segments="s",
+                segment_rule=dict.fromkeys(("lowest", "border", "own_share", "steepness", "threshold"), 1),
+            ),
+            "17 numbers in language.part_rule",
+        ),
         (lambda m: m["selection_rule"].pop("link"), "11 numbers in selection_rule"),
         (lambda m: m.pop("grammar"), "an object in grammar"),
         (lambda m: m["files"].pop("scene.ply"), "scene.ply in files"),
-        (lambda m: m.clear(), "version 5 of a lexsplat page"),
+        (lambda m: m.clear(), "version 6 of a lexsplat page"),
     ],
 )
 def test_a_manifest_that_lacks_a_field_is_refused_by_its_name(browser, ball_page, change, told):

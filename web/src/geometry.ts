@@ -20,6 +20,8 @@ export class Geometry {
   readonly opacities: Float32Array;
   /** Opacity times area: how much of a picture each splat covers from a distance of one. */
   readonly covers: Float32Array;
+  /** Red, green and blue of each splat, 0..1. */
+  readonly colors: Float32Array;
   /** Brightness of each splat, 0..1. */
   readonly lights: Float32Array;
   readonly #scales: Float32Array;
@@ -29,6 +31,7 @@ export class Geometry {
     this.centers = new Float32Array(3 * count);
     this.opacities = new Float32Array(count);
     this.covers = new Float32Array(count);
+    this.colors = new Float32Array(3 * count);
     this.lights = new Float32Array(count);
     this.#scales = new Float32Array(3 * count);
     this.#quats = new Float32Array(4 * count);
@@ -42,6 +45,7 @@ export class Geometry {
       this.opacities[i] = opacity;
       const { x, y, z } = scales;
       this.covers[i] = (opacity * x * y * z) / Math.max(Math.min(x, y, z), 1e-12);
+      this.colors.set([color.r, color.g, color.b], 3 * i);
       this.lights[i] = 0.2126 * color.r + 0.7152 * color.g + 0.0722 * color.b;
     });
   }

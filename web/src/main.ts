@@ -96,7 +96,8 @@ async function tables(files: Files, manifest: Manifest, stage: Stage, geometry: 
   const kinds = new Kinds(members, geometry, manifest.objects ?? [], manifest.kinds ?? {});
   const dictionary = new Dictionary(new TextDecoder().decode(phrases), table, language.num_codes, new Grammar(manifest.grammar));
   const spelling = english && letters ? new Spelling(letters, english.things) : null;
-  return new Tables(stage, geometry, codesOf, whole, dictionary, loader, kinds, spelling, english?.only ?? false);
+  const parts = language.part_rule && manifest.text ? { ...language.part_rule, words: manifest.text.everyday } : null;
+  return new Tables(stage, geometry, codesOf, whole, parts, dictionary, loader, kinds, spelling, english?.only ?? false);
 }
 
 const root = document.getElementById("page")!;

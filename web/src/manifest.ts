@@ -79,6 +79,30 @@ export interface SegmentRule {
   threshold: number;
 }
 
+/** The constants of lexsplat.queries.parts. */
+export interface PartRule {
+  /** Splats of a thing that can be cut, at least. */
+  fewest: number;
+  neighbors: number;
+  /** Differences of colors and of relevancies at which a link has 1/e of its weight. */
+  color: number;
+  score: number;
+  rounds: number;
+  shared: number;
+  best: number;
+  lowest: number;
+  mostly: number;
+  usual: number;
+  spread: number;
+  /** Places of the border that are tried. */
+  first: number;
+  last: number;
+  steps: number;
+  near: number;
+  few: number;
+  outside: number;
+}
+
 /** What lexsplat view says of itself: the page asks its server instead of its tables. */
 export interface ServerEntry {
   /** Counts the edits; a page that shows an earlier version is told so. */
@@ -135,6 +159,8 @@ export interface Manifest {
     segments: string | null;
     /** How segments are taken; null without segments. */
     segment_rule: SegmentRule | null;
+    /** How parts of things are cut; null without segments. */
+    part_rule: PartRule | null;
     objects: string;
     num_codes: number;
     method: string;
@@ -168,7 +194,7 @@ export interface Manifest {
   provenance: Record<string, unknown>;
 }
 
-const FORMAT_VERSION = 5;
+const FORMAT_VERSION = 6;
 
 const isText = (value: unknown): boolean => typeof value === "string";
 const isRecord = (value: unknown): boolean => typeof value === "object" && value !== null && !Array.isArray(value);
@@ -205,6 +231,10 @@ const FIELDS: [string, string, (value: unknown) => boolean][] = [
 ];
 
 const SEGMENT_RULE = ["lowest", "border", "own_share", "steepness", "threshold"];
+const PART_RULE = [
+  "fewest", "neighbors", "color", "score", "rounds", "shared", "best", "lowest", "mostly", "usual", "spread", "first", "last",
+  "steps", "near", "few", "outside",
+];
 const SELECTION_RULE = [
   "threshold", "link", "smallest_share", "convincing", "peak_count", "faint", "same_surface", "least_surface",
   "evidence_share", "evidence_count", "evidence_faint",
@@ -230,6 +260,7 @@ function lacking(manifest: Manifest): string {
   if (!manifest.server && !manifest.language) return "language or a server";
   if (manifest.language?.segments) {
     if (!isRule(manifest.language.segment_rule, SEGMENT_RULE)) return `${SEGMENT_RULE.length} numbers in language.segment_rule`;
+    if (!isRule(manifest.language.part_rule, PART_RULE)) return `${PART_RULE.length} numbers in language.part_rule`;
   }
   if (!isRule(manifest.selection_rule, SELECTION_RULE)) return `${SELECTION_RULE.length} numbers in selection_rule`;
   return manifest.files[manifest.scene.file] ? "" : `${manifest.scene.file} in files`;

@@ -60,7 +60,8 @@ export function besideThing(part: Heights, thing: Heights, best: Float32Array, r
 export function isPart(phrase: string, rule: EverydayRule): boolean {
   const words = phrase.toLowerCase().split(/\s+/).map((word) => word.replace(/s$/, ""));
   const last = words.pop()!;
-  return !rule.names.includes(last) && !rule.qualities.includes(last) && words.some((word) => rule.names.includes(word));
+  const named = rule.parts.includes(last) || (!rule.names.includes(last) && !rule.qualities.includes(last));
+  return named && words.some((word) => rule.names.includes(word));
 }
 
 /** The thing of which a phrase names a part; empty if it names none of the rule's parts. */

@@ -16,7 +16,7 @@ interface Cut {
 export class Segments {
   /** Segment of each splat at the lowest level, and what the training views show of it. */
   readonly #labels: Uint16Array | Uint32Array;
-  readonly #masses: Float64Array;
+  readonly masses: Float64Array;
   /** Segment at each level of each lowest segment, the lowest level first. */
   readonly #levels: Uint32Array[];
   readonly #sums: Float64Array;
@@ -39,10 +39,10 @@ export class Segments {
     };
     this.#levels = Array.from({ length: levels }, () => new Uint32Array(read(segments, 4)));
     this.#labels = wide ? new Uint32Array(read(count, 4)) : new Uint16Array(read(count, 2));
-    this.#masses = Float64Array.from(new Uint16Array(read(count, 2)), (half) => DataUtils.fromHalfFloat(half));
+    this.masses = Float64Array.from(new Uint16Array(read(count, 2)), (half) => DataUtils.fromHalfFloat(half));
     this.hidden = content.slice(at);
     this.#sums = new Float64Array(segments);
-    this.#labels.forEach((label, i) => (this.#sums[label] += this.#masses[i]));
+    this.#labels.forEach((label, i) => (this.#sums[label] += this.masses[i]));
   }
 
   /** The mean distributions over K codes of all segments of all levels, one after the other. */
@@ -52,7 +52,7 @@ export class Segments {
     const lowest = new Float64Array(this.#sums.length * numCodes);
     this.#labels.forEach((label, i) => {
       language.weights(i, own);
-      for (let t = 0; t < 4; t++) lowest[label * numCodes + language.codes[4 * i + t]] += this.#masses[i] * own[t];
+      for (let t = 0; t < 4; t++) lowest[label * numCodes + language.codes[4 * i + t]] += this.masses[i] * own[t];
     });
     const found = this.#levels.map((level) => {
       const count = level.reduce((most, segment) => Math.max(most, segment), 0) + 1;
@@ -73,7 +73,7 @@ export class Segments {
   scores(own: Float32Array): Float32Array {
     const lowest = new Float64Array(this.#sums.length);
     const labels = this.#labels;
-    const masses = this.#masses;
+    const masses = this.masses;
     for (let i = 0; i < own.length; i++) lowest[labels[i]] += masses[i] * own[i];
     let best: { cut: Cut; level: Uint32Array } | null = null;
     for (const level of [...this.#levels].reverse()) {

@@ -3,6 +3,8 @@
 import { type Answer, type Clicked, type Source, answered, painted } from "./answers";
 import { type Dictionary, plainly, singulars } from "./dictionary";
 import type { Geometry, Place } from "./geometry";
+import type { EverydayRule, PartRule } from "./manifest";
+import { partScores } from "./parts";
 import { type Language, shownSplats } from "./language";
 import { type Question, type Thing, understood } from "./questions";
 import { type Presence, hasColor, isPart, peakOf, presenceOf, strengthsOf, thingOfPart } from "./rules";
@@ -22,6 +24,8 @@ export class Tables implements Source {
     readonly geometry: Geometry,
     readonly language: Language,
     readonly segments: Segments | null,
+    /** How parts are cut, and the words that name them; null where they are answered by segments. */
+    readonly cuts: (PartRule & { words: EverydayRule }) | null,
     readonly dictionary: Dictionary,
     readonly loader: TowerLoader | null,
     readonly kinds: Kinds,
@@ -127,7 +131,7 @@ export class Tables implements Source {
       const own = this.language.scores(this.dictionary.table(known));
       const presence = this.dictionary.presence(known);
       const phrase = this.dictionary.phrases[known];
-      return answered(prompt, color, { phrase, from: "dictionary", ...this.#whole(own, presence) });
+      return answered(prompt, color, { phrase, from: "dictionary", ...(await this.#whole(phrase, own, presence)) });
     }
     const phrase = plainly(text) || text;
     const tower = await this.loader?.load();
@@ -136,7 +140,7 @@ export class Tables implements Source {
     const own = this.language.scores(described.table);
     const thing = thingOfPart(phrase, described.rule);
     const presence = this.#presence(phrase, own, described, thing ? tower.describe(thing) : null);
-    return answered(prompt, color, { phrase, from: "text tower", ...this.#whole(own, presence) });
+    return answered(prompt, color, { phrase, from: "text tower", ...(await this.#whole(phrase, own, presence)) });
   }
 
   /** As `lexsplat.queries.presence` has it: parts at segments, all else at objects. */
@@ -162,9 +166,19 @@ export class Tables implements Source {
   #parts: Float32Array | null = null;
 
   /** By segments, something would always be taken: what is not here keeps the scores of single splats. */
-  #whole(own: Float32Array, presence: Presence) {
-    const scores = this.segments && presence !== "no" ? this.segments.scores(own) : own;
-    return { scores, presence, threshold: this.geometry.rule.threshold };
+  async #whole(phrase: string, own: Float32Array, presence: Presence) {
+    const { threshold } = this.geometry.rule;
+    if (!this.segments || presence === "no") return { scores: own, presence, threshold };
+    return { scores: (await this.#cut(phrase, own, this.segments)) ?? this.segments.scores(own), presence, threshold };
+  }
+
+  /** Scores of a part, cut within its thing; null for what is none, or whose thing is not here. */
+  async #cut(phrase: string, own: Float32Array, { hidden, masses }: Segments): Promise<Float32Array | null> {
+    const name = this.cuts && thingOfPart(phrase, this.cuts.words);
+    const thing = name ? await this.#plain(name, name, "") : null;
+    if (!this.cuts || !thing || thing.presence === "no") return null;
+    const splats = Array.from(own.keys()).filter((i) => thing.scores[i] >= thing.threshold && !hidden[i]);
+    return splats.length < this.cuts.fewest ? null : partScores(own, splats, this.geometry, masses, this.cuts);
   }
 
   async refine(answer: Answer): Promise<void> {

@@ -5,7 +5,7 @@ image crops that show a part show what is around it. So the segments of a part's
 
 1. The relevancies of the thing's Gaussians are smoothed along links between neighbors. A link is weak where colors or
    relevancies differ: a black nose shares nothing with the fur around it.
-2. The part reaches from the best score down to the border: the score that few Gaussians have, near `_USUAL` of the way
+2. The part reaches from the best score down to the border: the score that few Gaussians have, near `USUAL` of the way
    from the thing's median to its best score. If the part is most of the thing, as the shade is of a lamp, its lowest
    scores take the place of the median.
 
@@ -27,21 +27,21 @@ from lexsplat.queries.segments import SEGMENT_THRESHOLD
 
 FEWEST = 50
 """Gaussians of a thing that can be cut."""
-_NEIGHBORS = 10
-_COLOR, _SCORE = 0.2, 0.4
+NEIGHBORS = 10
+COLOR, SCORE = 0.2, 0.4
 """Differences of colors, 0..1 in each channel, and of relevancies at which a link has 1/e of its weight."""
-_ROUNDS, _SHARED = 10, 0.9
+ROUNDS, SHARED = 10, 0.9
 """Rounds of smoothing, and the share that comes from the neighbors in each."""
-_BEST = 20
+BEST = 20
 """The best score is the mean of so many Gaussians."""
-_LOWEST, _MOSTLY = 0.05, 0.7
+LOWEST, MOSTLY = 0.05, 0.7
 """A median beyond this share of the way from the 5 % quantile to the best score lies in the part."""
-_USUAL, _SPREAD = 0.875, 0.2
-_STEPS = np.linspace(0.5, 0.95, 46)
+USUAL, SPREAD = 0.875, 0.2
+PLACES = np.linspace(0.5, 0.95, 46)
 """Places of the border that are tried, between what the thing scores and the best score."""
-_NEAR, _FEW = 0.05, 0.1
+NEAR, FEW = 0.05, 0.1
 """Reach of what counts as near a border, on the same scale, and the share of the part that is few in any case."""
-_OUTSIDE = 0.5
+OUTSIDE = 0.5
 """Factor on scores outside the thing."""
 
 FloatArray = NDArray[np.float64]
@@ -67,7 +67,7 @@ def part_scores(relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: 
     colors = (0.5 + SH_C0 * gaussians.sh0.detach()[:, 0].cpu()[places]).clamp(0, 1).double().numpy()
     smooth = _smoothed(own[places], means, colors, weights)
     border, best = _border(smooth, weights)
-    scores = _OUTSIDE * np.minimum(own / border, 1)
+    scores = OUTSIDE * np.minimum(own / border, 1)
     inside = np.clip((smooth - border) / max(best - border, 1e-6), 0, 1)
     scores[places] = np.where(smooth >= border, 1 + inside, np.minimum(smooth / border, 1 - 1e-4))
     return torch.from_numpy(SEGMENT_THRESHOLD * scores).to(relevancy)
@@ -75,17 +75,17 @@ def part_scores(relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: 
 
 def _smoothed(values: FloatArray, means: FloatArray, colors: FloatArray, weights: FloatArray) -> FloatArray:
     """Values ``[M]`` averaged with those of neighbors of a like color."""
-    count, neighbors = len(values), min(_NEIGHBORS + 1, len(values))
+    count, neighbors = len(values), min(NEIGHBORS + 1, len(values))
     found = cKDTree(means).query(means, k=neighbors)[1][:, 1:]
-    apart = ((colors[:, None] - colors[found]) ** 2).sum(-1) / _COLOR**2
-    apart += ((values[:, None] - values[found]) / _SCORE) ** 2
+    apart = ((colors[:, None] - colors[found]) ** 2).sum(-1) / COLOR**2
+    apart += ((values[:, None] - values[found]) / SCORE) ** 2
     rows = np.repeat(np.arange(count), neighbors - 1)
     links = csr_array((np.exp(-apart).ravel(), (rows, found.ravel())), shape=(count, count))
     links = links.maximum(links.T)
     totals = np.maximum(links @ weights, 1e-9)
     smooth = values
-    for _ in range(_ROUNDS):
-        smooth = (1 - _SHARED) * values + _SHARED * (links @ (weights * smooth)) / totals
+    for _ in range(ROUNDS):
+        smooth = (1 - SHARED) * values + SHARED * (links @ (weights * smooth)) / totals
     return np.asarray(smooth)
 
 
@@ -93,7 +93,7 @@ def _border(scores: FloatArray, weights: FloatArray) -> tuple[float, float]:
     """The lowest score of the part, and its best one, from the scores ``[M]`` of the thing."""
     order = np.argsort(scores, kind="stable")
     ranked, reached = scores[order], np.cumsum(weights[order])
-    total, best = reached[-1], float(ranked[-_BEST:].mean())
+    total, best = reached[-1], float(ranked[-BEST:].mean())
 
     def quantile(share: float) -> float:
         return float(ranked[min(np.searchsorted(reached, share * total), len(ranked) - 1)])
@@ -101,10 +101,10 @@ def _border(scores: FloatArray, weights: FloatArray) -> tuple[float, float]:
     def above(limits: FloatArray) -> FloatArray:
         return total - np.interp(limits, ranked, reached, left=0.0, right=total)
 
-    lowest, base = quantile(_LOWEST), quantile(0.5)
-    if base - lowest > _MOSTLY * (best - lowest):
+    lowest, base = quantile(LOWEST), quantile(0.5)
+    if base - lowest > MOSTLY * (best - lowest):
         base = lowest
-    limits, reach = base + _STEPS * (best - base), _NEAR * (best - base)
+    limits, reach = base + PLACES * (best - base), NEAR * (best - base)
     near = (above(limits - reach) - above(limits + reach)) / np.maximum(above(limits), 1e-9)
-    unusual = (_STEPS - _USUAL) ** 2 / (2 * _SPREAD**2)
-    return max(float(limits[(np.log(near + _FEW) + unusual).argmin()]), 1e-6), best
+    unusual = (PLACES - USUAL) ** 2 / (2 * SPREAD**2)
+    return max(float(limits[(np.log(near + FEW) + unusual).argmin()]), 1e-6), best

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from lexsplat.language.segments import Segments
-from lexsplat.queries import clusters, picking, presence, selection, thresholds
+from lexsplat.queries import clusters, parts, picking, presence, selection, thresholds
 from lexsplat.queries import segments as rule
 from lexsplat.queries.selection import Selection
 from lexsplat.scenes.formats.language import StoredLanguage
@@ -39,6 +39,29 @@ def segment_rule() -> dict[str, float]:
         "own_share": rule.OWN_SHARE,
         "steepness": rule.STEEPNESS,
         "threshold": rule.SEGMENT_THRESHOLD,
+    }
+
+
+def part_rule() -> dict[str, float]:
+    """The constants by which the page cuts parts of things: those of `lexsplat.queries.parts`."""
+    return {
+        "fewest": parts.FEWEST,
+        "neighbors": parts.NEIGHBORS,
+        "color": parts.COLOR,
+        "score": parts.SCORE,
+        "rounds": parts.ROUNDS,
+        "shared": parts.SHARED,
+        "best": parts.BEST,
+        "lowest": parts.LOWEST,
+        "mostly": parts.MOSTLY,
+        "usual": parts.USUAL,
+        "spread": parts.SPREAD,
+        "first": float(parts.PLACES[0]),
+        "last": float(parts.PLACES[-1]),
+        "steps": len(parts.PLACES),
+        "near": parts.NEAR,
+        "few": parts.FEW,
+        "outside": parts.OUTSIDE,
     }
 
 

@@ -28,7 +28,13 @@ from lexsplat.scenes.publishing.manifest import (
     one_line,
     scene_manifest,
 )
-from lexsplat.scenes.publishing.sidecar import objects_file, segment_rule, segments_file, splat_codes
+from lexsplat.scenes.publishing.sidecar import (
+    objects_file,
+    part_rule,
+    segment_rule,
+    segments_file,
+    splat_codes,
+)
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.text_tower import write_text_tower
 from lexsplat.scenes.publishing.vocabulary import (
@@ -222,6 +228,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
             "codes": "codes.bin",
             "segments": None if segments is None else "segments.bin",
             "segment_rule": None if segments is None else segment_rule(),
+            "part_rule": None if segments is None else part_rule(),
             "objects": "objects.bin",
             "num_codes": scene.field.codebook.num_codes,
             "method": scene.field.method,

@@ -1,0 +1,130 @@
+// Parts of things are cut within their thing: lexsplat.queries.parts in the browser. tests/scenes/test_published_page.py
+// compares the scores.
+
+import type { Geometry } from "./geometry";
+import type { PartRule } from "./manifest";
+
+/**
+ * Scores of a part: at least 0.5 exactly in it. `own` are the relevancies of single splats, `thing` the splats of its
+ * thing, and `masses` what the training views show of each splat.
+ */
+export function partScores(own: Float32Array, thing: number[], geometry: Geometry, masses: Float64Array, rule: PartRule): Float32Array {
+  const weights = Float64Array.from(thing, (i) => masses[i]);
+  const smooth = smoothed(Float64Array.from(thing, (i) => own[i]), thing, geometry, weights, rule);
+  const { border, best } = cut(smooth, weights, rule);
+  const scores = Float32Array.from(own, (score) => (rule.outside * Math.min(score / border, 1)) / 2);
+  thing.forEach((splat, n) => {
+    const inside = Math.min(Math.max((smooth[n] - border) / Math.max(best - border, 1e-6), 0), 1);
+    scores[splat] = (smooth[n] >= border ? 1 + inside : Math.min(smooth[n] / border, 1 - 1e-4)) / 2;
+  });
+  return scores;
+}
+
+/** Values averaged with those of neighbors of a like color and value. */
+function smoothed(values: Float64Array, thing: number[], geometry: Geometry, weights: Float64Array, rule: PartRule): Float64Array {
+  const { colors } = geometry;
+  const links = linked(thing, geometry.centers, rule.neighbors).map((others, n) =>
+    [...others].map((m): [number, number] => {
+      let apart = ((values[n] - values[m]) / rule.score) ** 2;
+      for (let c = 0; c < 3; c++) apart += ((colors[3 * thing[n] + c] - colors[3 * thing[m] + c]) / rule.color) ** 2;
+      return [m, Math.exp(-apart) * weights[m]];
+    }),
+  );
+  const totals = links.map((own) => Math.max(own.reduce((sum, [, weight]) => sum + weight, 0), 1e-9));
+  let smooth = values;
+  for (let round = 0; round < rule.rounds; round++) {
+    const before = smooth;
+    smooth = values.map((value, n) => {
+      const around = links[n].reduce((sum, [m, weight]) => sum + weight * before[m], 0) / totals[n];
+      return (1 - rule.shared) * value + rule.shared * around;
+    });
+  }
+  return smooth;
+}
+
+/** The neighbors of each splat: the nearest ones, and those that it is one of the nearest of. */
+function linked(thing: number[], centers: Float32Array, neighbors: number): Set<number>[] {
+  const spans = [0, 1, 2].map((axis) => {
+    const [low, high] = thing.reduce(([a, b], i) => [Math.min(a, centers[3 * i + axis]), Math.max(b, centers[3 * i + axis])], [Infinity, -Infinity]);
+    return high - low;
+  });
+  const axis = spans.indexOf(Math.max(...spans));
+  const along = (n: number): number => centers[3 * thing[n] + axis];
+  const order = thing.map((_, n) => n).sort((a, b) => along(a) - along(b));
+  const links = thing.map(() => new Set<number>());
+  order.forEach((n, place) => {
+    const nearest: { m: number; apart: number }[] = [];
+    const visit = (m: number): boolean => {
+      const most = nearest.length < neighbors ? Infinity : nearest[neighbors - 1].apart;
+      if ((along(m) - along(n)) ** 2 > most) return false; // and so are all beyond it
+      let apart = 0;
+      for (let c = 0; c < 3; c++) apart += (centers[3 * thing[m] + c] - centers[3 * thing[n] + c]) ** 2;
+      if (apart < most) {
+        nearest.splice(nearest.findLastIndex((other) => other.apart <= apart) + 1, 0, { m, apart });
+        nearest.length = Math.min(nearest.length, neighbors);
+      }
+      return true;
+    };
+    let [down, up] = [place - 1, place + 1];
+    while (down >= 0 || up < order.length) {
+      if (down >= 0 && !visit(order[down--])) down = -1;
+      if (up < order.length && !visit(order[up++])) up = order.length;
+    }
+    for (const { m } of nearest) {
+      links[n].add(m);
+      links[m].add(n);
+    }
+  });
+  return links;
+}
+
+/** The lowest score of the part, and its best one. */
+function cut(scores: Float64Array, weights: Float64Array, rule: PartRule): { border: number; best: number } {
+  const order = Array.from(scores.keys()).sort((a, b) => scores[a] - scores[b] || a - b);
+  const ranked = order.map((n) => scores[n]);
+  let sum = 0;
+  const reached = order.map((n) => (sum += weights[n]));
+  const total = sum;
+  const top = ranked.slice(-rule.best);
+  const best = top.reduce((all, score) => all + score, 0) / top.length;
+  const quantile = (share: number): number => ranked[Math.min(firstAt(reached, share * total), ranked.length - 1)];
+  const above = (limit: number): number => {
+    if (limit < ranked[0]) return total;
+    const next = firstAt(ranked, limit);
+    if (next >= ranked.length) return 0;
+    if (ranked[next] === limit) return total - reached[lastAt(ranked, limit)];
+    const share = (limit - ranked[next - 1]) / (ranked[next] - ranked[next - 1]);
+    return total - (reached[next - 1] + share * (reached[next] - reached[next - 1]));
+  };
+  const lowest = quantile(rule.lowest);
+  const median = quantile(0.5);
+  const base = median - lowest > rule.mostly * (best - lowest) ? lowest : median;
+  let found = { cost: Infinity, border: 0 };
+  for (let step = 0; step < rule.steps; step++) {
+    const place = rule.first + (step / (rule.steps - 1)) * (rule.last - rule.first);
+    const limit = base + place * (best - base);
+    const reach = rule.near * (best - base);
+    const near = (above(limit - reach) - above(limit + reach)) / Math.max(above(limit), 1e-9);
+    const cost = Math.log(near + rule.few) + (place - rule.usual) ** 2 / (2 * rule.spread ** 2);
+    if (cost < found.cost) found = { cost, border: limit };
+  }
+  return { border: Math.max(found.border, 1e-6), best };
+}
+
+/** The first place of sorted values that is at least a value; their number if there is none. */
+function firstAt(values: ArrayLike<number>, value: number): number {
+  let [low, high] = [0, values.length];
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (values[middle] < value) low = middle + 1;
+    else high = middle;
+  }
+  return low;
+}
+
+/** The last place of a value that sorted values have. */
+function lastAt(values: number[], value: number): number {
+  let place = firstAt(values, value);
+  while (place + 1 < values.length && values[place + 1] === value) place++;
+  return place;
+}
