@@ -12,6 +12,7 @@ Prints JSON.
 from __future__ import annotations
 
 import json
+import random
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,9 @@ from selection_ground_truth import (
 import lexsplat
 from lexsplat.geometry.boxes import gravity_up
 from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, Camera
+from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary
+from lexsplat.scenes.objects import objects_of
 
 KINDS = (
     "apple", "rubber duck", "mug", "stack of books", "vase", "ring", "traffic cone", "potted plant", "table lamp",
@@ -44,6 +48,8 @@ NEVER = (
     "giraffe", "bicycle", "airplane", "computer keyboard", "swimming pool", "guitar", "elephant", "traffic light",
     "bed", "shoe", "pizza", "dog",
 )  # fmt: skip
+SURFACE_KINDS = ("table", "cloth", "wall", "floor")
+NAMES_ASKED = 300
 COLORS = ("red", "green", "blue", "yellow", "white", "brown", "pink", "purple", "orange")
 
 
@@ -52,17 +58,19 @@ def main() -> None:
     parser.add_argument("--scene", type=Path, action="append", default=[])
     parser.add_argument("--ground-truth-of", action="append", default=[], metavar="SCENE=FOLDER")
     parser.add_argument("--stride", type=int, default=1, help="use every n-th view of the ground truth")
-    parser.add_argument("--only", choices=("presence", "accuracy"), help="measure only this")
+    parser.add_argument("--only", choices=("presence", "accuracy", "inventory"), help="measure only this")
     options = parser.parse_args()
     pairs = (item.split("=", 1) for item in options.ground_truth_of)
     ground_truths = {Path(key): Path(value) for key, value in pairs}
     result: dict = {"scenes": {}}
     for folder in dict.fromkeys(options.scene):
         measured = result["scenes"].setdefault(str(folder), {})
-        if options.only != "accuracy":
+        if options.only in (None, "presence"):
             measured["presence"] = presence(folder, ground_truths[folder])
-        if options.only != "presence":
+        if options.only in (None, "accuracy"):
             measured["accuracy"] = accuracy(folder, ground_truths[folder], options.stride)
+        if options.only in (None, "inventory"):
+            measured["inventory"] = inventory(folder, ground_truths[folder], options.stride)
     print(json.dumps(result, indent=1))
     write_record(options.json, table_rows(result), **result)
 
@@ -72,6 +80,7 @@ def table_rows(result: dict) -> list[dict]:
     rows = []
     for scene, measured in result["scenes"].items():
         row: dict = {"scene": Path(scene).name, **measured.get("accuracy", {}).get("mean", {})}
+        row |= {name: measured["inventory"][name] for name in ("found", "false") if "inventory" in measured}
         for group, found in measured.get("presence", {}).items():
             if isinstance(found, dict):
                 row[f"{group}: yes / unsure / no"] = f"{found['yes']} / {found['unsure']} / {found['no']}"
@@ -93,7 +102,7 @@ def evidence(folder: Path, ground_truth: Path) -> tuple[dict, dict, dict]:
     known = kinds | {ALIASES.get(kind, kind) for kind in kinds}
     absent = [kind for kind in KINDS if kind not in known and kind.split()[-1] not in kinds] + list(NEVER)
     recolored = []
-    for number, kind in enumerate(sorted(kinds - {"table", "wall", "floor", "cloth"})):
+    for number, kind in enumerate(sorted(kinds - set(SURFACE_KINDS))):
         taken = {thing["color"] for thing in things if thing["kind"] == kind}
         free = [color for color in COLORS if color not in taken]
         recolored.append(f"{free[number % len(free)]} {kind}")
@@ -153,6 +162,47 @@ def accuracy(folder: Path, ground_truth: Path, stride: int) -> dict:
     names = ("f1", "precision", "recall", "box_iou")
     means = {name: round(float(np.mean([row[name] for row in rows.values()])), 3) for name in names}
     return {"mean": means, "box_iou_of_true_gaussians": ideal, "each": rows}
+
+
+def inventory(folder: Path, ground_truth: Path, stride: int) -> dict:
+    """Things that `Scene.objects` finds under a right name with an IoU of Gaussians of at least .5.
+
+    The names are the bundled ones and everyday words drawn with a seed, `NAMES_ASKED` together. A name is right if it
+    ends with the last word of the thing's kind or alias. Gaussians are weighted by what the views show of them.
+    """
+    scene = lexsplat.open_scene(folder)
+    lifted = lift_labels(scene.gaussians, load_ground_truth(ground_truth, stride), 256)
+    known = default_vocabulary("bundled")
+    drawn = random.Random(0).sample(sorted(set(everyday_words()) - set(known)), NAMES_ASKED - len(known))
+    objects = objects_of(scene, known + drawn)
+    numbers, best, used = lifted.labels // 10, {}, set()
+    for number, thing in json.loads((ground_truth / "things.json").read_text()).items():
+        wanted, kind = (numbers == int(number)) & (lifted.labels > 0), thing["kind"]
+        right = {ALIASES.get(kind, kind).split()[-1].removesuffix("s"), kind.removesuffix("s")}
+        if kind == "cloth":
+            right.add("tablecloth")
+        ious = [
+            (iou_of(each.mask, wanted, lifted.weights), place)
+            for place, each in enumerate(objects)
+            if each.phrase.split()[-1].removesuffix("s") in right
+        ]
+        iou, place = max(ious, default=(0.0, -1))
+        best[f"{thing['color']} {kind}"] = round(iou, 3)
+        used |= {place} if iou >= 0.5 else set()
+    things = {name: iou for name, iou in best.items() if name.split()[-1] not in SURFACE_KINDS}
+    false = [
+        each.phrase
+        for place, each in enumerate(objects)
+        if place not in used and each.phrase not in SURFACES | STUFF
+    ]
+    found = sum(iou >= 0.5 for iou in things.values())
+    return {"found": f"{found} of {len(things)}", "false": len(false), "false names": false, "IoU": best}
+
+
+def iou_of(mask, wanted, weights) -> float:
+    """Intersection over union of two sets of Gaussians, weighted."""
+    mask = mask.cpu()
+    return float(weights[mask & wanted].sum() / weights[mask | wanted].sum().clamp_min(1e-12))
 
 
 def best_box_iou(scene, lifted, views, meanings, up) -> float:
