@@ -5,7 +5,7 @@ import torch
 from support.splats import solid
 
 from lexsplat.geometry.gaussians import SH_C0
-from lexsplat.queries.parts import part_scores
+from lexsplat.queries.parts import part_scores, with_parts
 from lexsplat.queries.segments import SEGMENT_THRESHOLD
 
 BROWN, TAN, BLACK = (0.4, 0.25, 0.1), (0.7, 0.55, 0.35), (0.05, 0.05, 0.05)
@@ -103,3 +103,20 @@ def test_the_order_of_the_gaussians_does_not_matter():
     straight = part_scores(own, thing, gaussians, masses)
     turned = part_scores(own[order], thing[order], gaussians.select(order), masses)
     torch.testing.assert_close(turned, straight[order], rtol=1e-4, atol=1e-4)
+
+
+def test_a_thing_that_is_described_as_the_part_throughout_is_not_cut():
+    gaussians, places = bear()
+    own = torch.from_numpy(np.array([0.1, 0.8, 0.8, 0.9, 0.8])[places]).float()
+    assert part_scores(own, torch.from_numpy(places != TABLE), gaussians, torch.ones(len(places))) is None
+
+
+def test_a_part_that_the_name_of_the_thing_misses_is_joined_but_nothing_apart_from_it():
+    gaussians, places = bear()
+    far = torch.from_numpy(gaussians.means[:, 0].numpy() > 2.5)
+    thing = torch.from_numpy((places != TABLE) & (places != NOSE))
+    taken = torch.from_numpy(places == NOSE) | far
+    labels = torch.from_numpy(np.where(far.numpy(), 9, places))
+    found = with_parts(thing, taken, gaussians, labels)
+    assert torch.equal(found, torch.from_numpy(places != TABLE))
+    assert torch.equal(with_parts(thing, thing, gaussians, labels), thing)

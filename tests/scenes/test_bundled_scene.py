@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,6 +54,21 @@ def test_its_language_uses_the_bundled_encoder(demo):
 def test_the_earlier_name_of_the_bundled_encoder_means_it_everywhere():
     assert open_scene("demo", clip="embedded").clip == "bundled"
     assert BuildConfig(clip="embedded", dino="embedded").clip == "bundled"
+
+
+@pytest.mark.parametrize(("part", "thing"), [("mug handle", "mug"), ("bear nose", "bear"), ("car wheels", "car")])
+def test_a_part_lies_within_its_thing_and_is_the_smaller_share_of_it(demo, part, thing):
+    inside, whole = (demo.ask(phrase).chosen(0) for phrase in (part, thing))
+    assert demo.ask(part).presences == ("yes",)
+    assert 0 < int(inside.sum()) < 0.5 * int(whole.sum())
+    assert int((inside & ~whole).sum()) <= 0.1 * int(inside.sum())
+
+
+def test_single_gaussians_and_the_form_of_the_paper_cut_no_parts(demo):
+    alone = open_scene("demo", device="cpu")
+    alone.query = replace(alone.query, form="code")
+    answer = alone.ask("mug handle")
+    assert torch.equal(answer.scores[0], answer.words[0].own)
 
 
 @pytest.mark.parametrize("prompt", ["red apple", "blue mug", "rubber duck", "pumpkin"])

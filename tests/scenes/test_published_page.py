@@ -705,7 +705,7 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_told_in_one_line(browser
                 segments="s",
                 segment_rule=dict.fromkeys(("lowest", "border", "own_share", "steepness", "threshold"), 1),
             ),
-            "17 numbers in language.part_rule",
+            "18 numbers in language.part_rule",
         ),
         (lambda m: m["selection_rule"].pop("link"), "11 numbers in selection_rule"),
         (lambda m: m.pop("grammar"), "an object in grammar"),

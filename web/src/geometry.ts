@@ -161,7 +161,7 @@ export class Geometry {
     const all = firm.length ? firm : chosen;
     const step = Math.ceil(all.length / MOST_LINKED);
     const makers = step > 1 ? all.filter((_, n) => n % step === 0) : all;
-    const link = this.rule.link * this.#spacing(makers);
+    const link = this.rule.link * this.spacing(makers);
     const grid = new Grid(this.centers, makers, link);
     const parents = new Map<number, number>(makers.map((i) => [i, i]));
     const root = (i: number): number => {
@@ -187,8 +187,13 @@ export class Geometry {
     return [...clusters.values()];
   }
 
+  /** Some splats in cubes, to find those within a distance. */
+  grid(splats: number[], side: number): Grid {
+    return new Grid(this.centers, splats, side);
+  }
+
   /** Median distance to the sixth neighbor, of a sample. */
-  #spacing(splats: number[]): number {
+  spacing(splats: number[]): number {
     const step = Math.max(1, Math.ceil((splats.length * splats.length) / 4e6));
     const found: number[] = [];
     for (let n = 0; n < splats.length; n += step) {
@@ -245,7 +250,7 @@ function squared(centers: Float32Array, i: number, j: number): number {
 }
 
 /** Splats in cubes, to find those within a distance. */
-class Grid {
+export class Grid {
   readonly #cells = new Map<number, number[]>();
 
   constructor(readonly centers: Float32Array, splats: number[], readonly side: number) {

@@ -92,6 +92,8 @@ export interface PartRule {
   best: number;
   lowest: number;
   mostly: number;
+  /** Where the lowest scores of a thing reach this, all of it is the part. */
+  all: number;
   usual: number;
   spread: number;
   /** Places of the border that are tried. */
@@ -232,7 +234,7 @@ const FIELDS: [string, string, (value: unknown) => boolean][] = [
 
 const SEGMENT_RULE = ["lowest", "border", "own_share", "steepness", "threshold"];
 const PART_RULE = [
-  "fewest", "neighbors", "color", "score", "rounds", "shared", "best", "lowest", "mostly", "usual", "spread", "first", "last",
+  "fewest", "neighbors", "color", "score", "rounds", "shared", "best", "lowest", "mostly", "all", "usual", "spread", "first", "last",
   "steps", "near", "few", "outside",
 ];
 const SELECTION_RULE = [

@@ -4,14 +4,28 @@
 import type { Geometry } from "./geometry";
 import type { PartRule } from "./manifest";
 
+/** A thing with the segments beside it that are taken for a part of it: a bottle may be found without its cork. */
+export function withParts(thing: number[], taken: number[], geometry: Geometry, labels: ArrayLike<number>): number[] {
+  const inside = new Set(thing);
+  const others = taken.filter((i) => !inside.has(i));
+  if (others.length === 0) return thing;
+  const reach = geometry.rule.link * geometry.spacing(thing);
+  const near = new Set<number>();
+  const grid = geometry.grid(thing, reach);
+  for (const i of others) if (!near.has(labels[i])) grid.near(i, () => near.add(labels[i]) !== null);
+  return [...thing, ...others.filter((i) => near.has(labels[i]))].sort((a, b) => a - b);
+}
+
 /**
- * Scores of a part: at least 0.5 exactly in it. `own` are the relevancies of single splats, `thing` the splats of its
+ * Scores of a part: at least 0.5 exactly in it; null if nearly all of its thing is described as the part. `own` are the relevancies of single splats, `thing` the splats of its
  * thing, and `masses` what the training views show of each splat.
  */
-export function partScores(own: Float32Array, thing: number[], geometry: Geometry, masses: Float64Array, rule: PartRule): Float32Array {
+export function partScores(own: Float32Array, thing: number[], geometry: Geometry, masses: Float64Array, rule: PartRule): Float32Array | null {
   const weights = Float64Array.from(thing, (i) => masses[i]);
   const smooth = smoothed(Float64Array.from(thing, (i) => own[i]), thing, geometry, weights, rule);
-  const { border, best } = cut(smooth, weights, rule);
+  const found = cut(smooth, weights, rule);
+  if (found.lowest >= rule.all) return null;
+  const { border, best } = found;
   const scores = Float32Array.from(own, (score) => (rule.outside * Math.min(score / border, 1)) / 2);
   thing.forEach((splat, n) => {
     const inside = Math.min(Math.max((smooth[n] - border) / Math.max(best - border, 1e-6), 0), 1);
@@ -79,7 +93,7 @@ function linked(thing: number[], centers: Float32Array, neighbors: number): Set<
 }
 
 /** The lowest score of the part, and its best one. */
-function cut(scores: Float64Array, weights: Float64Array, rule: PartRule): { border: number; best: number } {
+function cut(scores: Float64Array, weights: Float64Array, rule: PartRule): { border: number; best: number; lowest: number } {
   const order = Array.from(scores.keys()).sort((a, b) => scores[a] - scores[b] || a - b);
   const ranked = order.map((n) => scores[n]);
   let sum = 0;
@@ -88,14 +102,7 @@ function cut(scores: Float64Array, weights: Float64Array, rule: PartRule): { bor
   const top = ranked.slice(-rule.best);
   const best = top.reduce((all, score) => all + score, 0) / top.length;
   const quantile = (share: number): number => ranked[Math.min(firstAt(reached, share * total), ranked.length - 1)];
-  const above = (limit: number): number => {
-    if (limit < ranked[0]) return total;
-    const next = firstAt(ranked, limit);
-    if (next >= ranked.length) return 0;
-    if (ranked[next] === limit) return total - reached[lastAt(ranked, limit)];
-    const share = (limit - ranked[next - 1]) / (ranked[next] - ranked[next - 1]);
-    return total - (reached[next - 1] + share * (reached[next] - reached[next - 1]));
-  };
+  const above = (limit: number): number => total - (reached[firstAt(ranked, limit) - 1] ?? 0);
   const lowest = quantile(rule.lowest);
   const median = quantile(0.5);
   const base = median - lowest > rule.mostly * (best - lowest) ? lowest : median;
@@ -108,7 +115,7 @@ function cut(scores: Float64Array, weights: Float64Array, rule: PartRule): { bor
     const cost = Math.log(near + rule.few) + (place - rule.usual) ** 2 / (2 * rule.spread ** 2);
     if (cost < found.cost) found = { cost, border: limit };
   }
-  return { border: Math.max(found.border, 1e-6), best };
+  return { border: Math.max(found.border, 1e-6), best, lowest };
 }
 
 /** The first place of sorted values that is at least a value; their number if there is none. */
@@ -120,11 +127,4 @@ function firstAt(values: ArrayLike<number>, value: number): number {
     else high = middle;
   }
   return low;
-}
-
-/** The last place of a value that sorted values have. */
-function lastAt(values: number[], value: number): number {
-  let place = firstAt(values, value);
-  while (place + 1 < values.length && values[place + 1] === value) place++;
-  return place;
 }

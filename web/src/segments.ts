@@ -15,7 +15,7 @@ interface Cut {
 
 export class Segments {
   /** Segment of each splat at the lowest level, and what the training views show of it. */
-  readonly #labels: Uint16Array | Uint32Array;
+  readonly labels: Uint16Array | Uint32Array;
   readonly masses: Float64Array;
   /** Segment at each level of each lowest segment, the lowest level first. */
   readonly #levels: Uint32Array[];
@@ -38,11 +38,11 @@ export class Segments {
       return content.slice(at - length * bytes, at).buffer;
     };
     this.#levels = Array.from({ length: levels }, () => new Uint32Array(read(segments, 4)));
-    this.#labels = wide ? new Uint32Array(read(count, 4)) : new Uint16Array(read(count, 2));
+    this.labels = wide ? new Uint32Array(read(count, 4)) : new Uint16Array(read(count, 2));
     this.masses = Float64Array.from(new Uint16Array(read(count, 2)), (half) => DataUtils.fromHalfFloat(half));
     this.hidden = content.slice(at);
     this.#sums = new Float64Array(segments);
-    this.#labels.forEach((label, i) => (this.#sums[label] += this.masses[i]));
+    this.labels.forEach((label, i) => (this.#sums[label] += this.masses[i]));
   }
 
   /** The mean distributions over K codes of all segments of all levels, one after the other. */
@@ -50,7 +50,7 @@ export class Segments {
     const { numCodes } = language;
     const own = new Float32Array(4);
     const lowest = new Float64Array(this.#sums.length * numCodes);
-    this.#labels.forEach((label, i) => {
+    this.labels.forEach((label, i) => {
       language.weights(i, own);
       for (let t = 0; t < 4; t++) lowest[label * numCodes + language.codes[4 * i + t]] += this.masses[i] * own[t];
     });
@@ -72,7 +72,7 @@ export class Segments {
   /** Scores by segments from those of single splats: at least the threshold exactly where a segment is taken. */
   scores(own: Float32Array): Float32Array {
     const lowest = new Float64Array(this.#sums.length);
-    const labels = this.#labels;
+    const labels = this.labels;
     const masses = this.masses;
     for (let i = 0; i < own.length; i++) lowest[labels[i]] += masses[i] * own[i];
     let best: { cut: Cut; level: Uint32Array } | null = null;

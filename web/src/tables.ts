@@ -4,7 +4,7 @@ import { type Answer, type Clicked, type Source, answered, painted } from "./ans
 import { type Dictionary, plainly, singulars } from "./dictionary";
 import type { Geometry, Place } from "./geometry";
 import type { EverydayRule, PartRule } from "./manifest";
-import { partScores } from "./parts";
+import { partScores, withParts } from "./parts";
 import { type Language, shownSplats } from "./language";
 import { type Question, type Thing, understood } from "./questions";
 import { type Presence, hasColor, isPart, peakOf, presenceOf, strengthsOf, thingOfPart } from "./rules";
@@ -169,16 +169,21 @@ export class Tables implements Source {
   async #whole(phrase: string, own: Float32Array, presence: Presence) {
     const { threshold } = this.geometry.rule;
     if (!this.segments || presence === "no") return { scores: own, presence, threshold };
-    return { scores: (await this.#cut(phrase, own, this.segments)) ?? this.segments.scores(own), presence, threshold };
+    const whole = this.segments.scores(own);
+    return { scores: (await this.#cut(phrase, own, whole, this.segments)) ?? whole, presence, threshold };
   }
 
   /** Scores of a part, cut within its thing; null for what is none, or whose thing is not here. */
-  async #cut(phrase: string, own: Float32Array, { hidden, masses }: Segments): Promise<Float32Array | null> {
+  async #cut(phrase: string, own: Float32Array, whole: Float32Array, segments: Segments): Promise<Float32Array | null> {
     const name = this.cuts && thingOfPart(phrase, this.cuts.words);
     const thing = name ? await this.#plain(name, name, "") : null;
     if (!this.cuts || !thing || thing.presence === "no") return null;
-    const splats = Array.from(own.keys()).filter((i) => thing.scores[i] >= thing.threshold && !hidden[i]);
-    return splats.length < this.cuts.fewest ? null : partScores(own, splats, this.geometry, masses, this.cuts);
+    const seen = (scores: Float32Array): number[] =>
+      Array.from(scores.keys()).filter((i) => scores[i] >= thing.threshold && !segments.hidden[i]);
+    const splats = seen(thing.scores);
+    if (splats.length < this.cuts.fewest) return null;
+    const joined = withParts(splats, seen(whole), this.geometry, segments.labels);
+    return partScores(own, joined, this.geometry, segments.masses, this.cuts);
   }
 
   async refine(answer: Answer): Promise<void> {

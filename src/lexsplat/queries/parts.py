@@ -23,12 +23,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
+from lexsplat.queries.clusters import LINK, spacing
 from lexsplat.queries.segments import SEGMENT_THRESHOLD
 
 FEWEST = 50
 """Gaussians of a thing that can be cut."""
 NEIGHBORS = 10
-COLOR, SCORE = 0.2, 0.4
+COLOR, SCORE = 0.2, 0.3
 """Differences of colors, 0..1 in each channel, and of relevancies at which a link has 1/e of its weight."""
 ROUNDS, SHARED = 10, 0.9
 """Rounds of smoothing, and the share that comes from the neighbors in each."""
@@ -36,7 +37,9 @@ BEST = 20
 """The best score is the mean of so many Gaussians."""
 LOWEST, MOSTLY = 0.05, 0.7
 """A median beyond this share of the way from the 5 % quantile to the best score lies in the part."""
-USUAL, SPREAD = 0.875, 0.2
+ALL = 0.5
+"""Where the 5 % quantile of a thing reaches this, all of it is described as the part."""
+USUAL, SPREAD = 0.875, 0.25
 PLACES = np.linspace(0.5, 0.95, 46)
 """Places of the border that are tried, between what the thing scores and the best score."""
 NEAR, FEW = 0.05, 0.1
@@ -48,8 +51,34 @@ FloatArray = NDArray[np.float64]
 
 
 @torch.no_grad()
-def part_scores(relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: Tensor) -> Tensor:
-    """Scores of a part.
+def with_parts(thing: Tensor, taken: Tensor, gaussians: Gaussians, labels: Tensor) -> Tensor:
+    """A thing with the segments beside it that are taken for a part of it ``[N]`` bool.
+
+    The name of a bottle may describe it without its cork.
+
+    Args:
+        thing: The Gaussians that the thing's name selects ``[N]`` bool, at least two.
+        taken: The Gaussians of segments that are taken for the part ``[N]`` bool.
+        gaussians: The scene.
+        labels: Lowest segment of each Gaussian ``[N]``.
+    """
+    means, inside = gaussians.means.detach().cpu().double().numpy(), thing.cpu().numpy()
+    others = np.flatnonzero(taken.cpu().numpy() & ~inside)
+    if not len(others):
+        return thing
+    apart = cKDTree(means[inside]).query(means[others])[0]
+    segments = labels.cpu().numpy()[others]
+    near = np.unique(segments[apart <= LINK * spacing(means[inside])])
+    joined = thing.clone()
+    joined[torch.from_numpy(others[np.isin(segments, near)]).to(thing.device)] = True
+    return joined
+
+
+@torch.no_grad()
+def part_scores(
+    relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: Tensor
+) -> Tensor | None:
+    """Scores of a part; None if nearly all of its thing is described as the part, so that there is nothing to cut.
 
     Args:
         relevancy: Relevancy of each Gaussian by itself ``[N]`` in 0..1.
@@ -66,6 +95,8 @@ def part_scores(relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: 
     means = gaussians.means.detach().cpu()[places].double().numpy()
     colors = (0.5 + SH_C0 * gaussians.sh0.detach()[:, 0].cpu()[places]).clamp(0, 1).double().numpy()
     smooth = _smoothed(own[places], means, colors, weights)
+    if _quantile(smooth, weights, LOWEST) >= ALL:
+        return None
     border, best = _border(smooth, weights)
     scores = OUTSIDE * np.minimum(own / border, 1)
     inside = np.clip((smooth - border) / max(best - border, 1e-6), 0, 1)
@@ -89,19 +120,22 @@ def _smoothed(values: FloatArray, means: FloatArray, colors: FloatArray, weights
     return np.asarray(smooth)
 
 
+def _quantile(scores: FloatArray, weights: FloatArray, share: float) -> float:
+    order = np.argsort(scores, kind="stable")
+    reached = np.cumsum(weights[order])
+    return float(scores[order[min(np.searchsorted(reached, share * reached[-1]), len(order) - 1)]])
+
+
 def _border(scores: FloatArray, weights: FloatArray) -> tuple[float, float]:
     """The lowest score of the part, and its best one, from the scores ``[M]`` of the thing."""
     order = np.argsort(scores, kind="stable")
-    ranked, reached = scores[order], np.cumsum(weights[order])
-    total, best = reached[-1], float(ranked[-BEST:].mean())
-
-    def quantile(share: float) -> float:
-        return float(ranked[min(np.searchsorted(reached, share * total), len(ranked) - 1)])
+    ranked, reached = scores[order], np.concatenate([[0.0], np.cumsum(weights[order])])
+    best = float(ranked[-BEST:].mean())
 
     def above(limits: FloatArray) -> FloatArray:
-        return total - np.interp(limits, ranked, reached, left=0.0, right=total)
+        return np.asarray(reached[-1] - reached[np.searchsorted(ranked, limits)])
 
-    lowest, base = quantile(LOWEST), quantile(0.5)
+    lowest, base = _quantile(scores, weights, LOWEST), _quantile(scores, weights, 0.5)
     if base - lowest > MOSTLY * (best - lowest):
         base = lowest
     limits, reach = base + PLACES * (best - base), NEAR * (best - base)

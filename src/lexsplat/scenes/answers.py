@@ -17,7 +17,7 @@ from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.grammar import understand, undetermined
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.kinds import is_kind, is_of_kind
-from lexsplat.queries.parts import FEWEST, part_scores
+from lexsplat.queries.parts import FEWEST, part_scores, with_parts
 from lexsplat.queries.relevancy import check_prompts, render_relevancy
 from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
@@ -182,7 +182,10 @@ def of_part(scene: Scene, prompt: str, word: Word) -> Word:
     thing = found.chosen(0)
     if found.presences[0] == "no" or int(thing.sum()) < FEWEST:
         return word
-    return replace(word, scores=part_scores(word.own, thing, scene.gaussians, segments.masses))
+    taken = (word.scores >= BORDER) & ~scene.hidden
+    thing = with_parts(thing, taken, scene.gaussians, segments.labels)
+    scores = part_scores(word.own, thing, scene.gaussians, segments.masses)
+    return word if scores is None else replace(word, scores=scores)
 
 
 def answer_queries(

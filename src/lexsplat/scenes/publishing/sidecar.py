@@ -54,6 +54,7 @@ def part_rule() -> dict[str, float]:
         "best": parts.BEST,
         "lowest": parts.LOWEST,
         "mostly": parts.MOSTLY,
+        "all": parts.ALL,
         "usual": parts.USUAL,
         "spread": parts.SPREAD,
         "first": float(parts.PLACES[0]),
