@@ -35,7 +35,7 @@ from lexsplat.features.encoders import load_clip
 from lexsplat.features.hub import model_folder
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.relevancy import CANONICAL_PHRASES
-from lexsplat.queries.vocabulary import COLORS
+from lexsplat.queries.vocabulary import COLORS, words
 
 KINDS = (
     "apple", "rubber duck", "mug", "stack of books", "vase", "ring", "traffic cone", "potted plant",
@@ -45,12 +45,11 @@ KINDS = (
 """Names of the kind that the bundled encoder knows."""
 OTHERS = ("fruit", "something made of metal", "something to drink from")
 """Other phrases that it knows."""
-MATERIALS = "wooden metal plastic glass stone leather paper rubber ceramic striped checkered old small".split()
-PARTS = """
-    handle lid cap spout neck rim knob stem leaf petal shade cord string flame wick spine page button sole lace wing
-    beak nose ear eye mouth tail paw foot leg arm
-""".split()
-
+MATERIALS = words(
+    "wooden, metal, plastic, glass, stone, leather, paper, rubber, ceramic, striped, checkered, old, small"
+)
+PARTS = words("""handle, lid, cap, spout, neck, rim, knob, stem, leaf, petal, shade, cord, string, flame, wick, spine,
+    page, button, sole, lace, wing, beak, nose, ear, eye, mouth, tail, paw, foot, leg, arm""")
 NAMES = 4
 """Form of the names that the bundled encoder knows, alone (`Phrases`)."""
 

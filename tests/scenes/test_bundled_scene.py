@@ -56,7 +56,9 @@ def test_the_earlier_name_of_the_bundled_encoder_means_it_everywhere():
     assert BuildConfig(clip="embedded", dino="embedded").clip == "bundled"
 
 
-@pytest.mark.parametrize(("part", "thing"), [("mug handle", "mug"), ("bear nose", "bear"), ("car wheels", "car")])
+@pytest.mark.parametrize(
+    ("part", "thing"), [("mug handle", "mug"), ("bear nose", "bear"), ("car wheels", "car")]
+)
 def test_a_part_lies_within_its_thing_and_is_the_smaller_share_of_it(demo, part, thing):
     inside, whole = (demo.ask(phrase).chosen(0) for phrase in (part, thing))
     assert demo.ask(part).presences == ("yes",)

@@ -130,7 +130,8 @@ def test_answers_are_those_of_python(page, demo):
     for number, answer in enumerate(found):
         scores = np.frombuffer(base64.b64decode(answer["scores"]), np.float32)
         expected, near = asked.scores[number].numpy(), 0.02
-        if thing_of_part(answer["phrase"]):  # rounded centers have other neighbors, and a part is stretched to 0..1
+        if thing_of_part(answer["phrase"]):
+            # Rounded centers have other neighbors, and the scores of a part are stretched to 0..1.
             assert np.quantile(np.abs(scores - expected), 0.999) <= 10 / 255, answer["prompt"]
             near = 0.05
             others = ((scores >= 0.5) != (expected >= 0.5)).sum()

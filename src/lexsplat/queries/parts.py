@@ -1,11 +1,12 @@
 """Parts of things, such as "mug handle": cut within their thing, where colors change.
 
-A part may be smaller than the segment that holds it, and a segment of its surroundings may score nearly as high, because
-image crops that show a part show what is around it. So the segments of a part's thing do not say where the part ends.
+A part may be smaller than the segment that holds it. What is around it may score nearly as high, because image crops
+that show a part show its surroundings. So segments do not say where a part ends.
 
-1. The relevancies of the thing's Gaussians are smoothed along links between neighbors. A link is weak where colors or
+1. The thing is what its name selects, with the segments beside it that are taken for the part (`with_parts`).
+2. The relevancies of the thing's Gaussians are smoothed along links between neighbors. A link is weak where colors or
    relevancies differ: a black nose shares nothing with the fur around it.
-2. The part reaches from the best score down to the border: the score that few Gaussians have, near `USUAL` of the way
+3. The part reaches from the best score down to the border: the score that few Gaussians have, near `USUAL` of the way
    from the thing's median to its best score. If the part is most of the thing, as the shade is of a lamp, its lowest
    scores take the place of the median.
 
@@ -75,9 +76,7 @@ def with_parts(thing: Tensor, taken: Tensor, gaussians: Gaussians, labels: Tenso
 
 
 @torch.no_grad()
-def part_scores(
-    relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: Tensor
-) -> Tensor | None:
+def part_scores(relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: Tensor) -> Tensor | None:
     """Scores of a part; None if nearly all of its thing is described as the part, so that there is nothing to cut.
 
     Args:

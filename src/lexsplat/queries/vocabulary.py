@@ -28,8 +28,8 @@ _QUALITIES = """
 """
 _PARTS = """
     handle, lid, cap, spout, neck, rim, knob, stem, stalk, leaf, petal, shade, cord, string, flame, wick, cork,
-    spine, page, button, sole, lace, wheel, tire, roof, wing, beak, head, face, nose, ear, eye, mouth, tail, belly, paw,
-    foot, leg, arm
+    spine, page, button, sole, lace, wheel, tire, roof, wing, beak, head, face, nose, ear, eye, mouth, tail, belly,
+    paw, foot, leg, arm
 """
 _SURFACES = """
     table, tablecloth, desk, cloth, wall, floor, ceiling, carpet, grass, road, sky, water, sand, stairs, wood, metal,
