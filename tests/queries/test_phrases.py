@@ -270,6 +270,22 @@ def test_names_of_things_keep_their_function_words(text):
     assert not understand(text).unknown
 
 
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("the nose of the bear", "bear nose"), ("handle of the red mug", "red mug handle"),
+        ("wheels of my toy car", "toy car wheels"), ("where is the shade of the table lamp?", "table lamp shade"),
+        ("the cup of tea", "cup of tea"), ("nose of clay", "nose of clay"),
+    ],
+)  # fmt: skip
+def test_a_part_of_a_thing_is_named_behind_the_thing(text, part):
+    assert understand(text).phrase == understand(part).phrase
+
+
+def test_the_place_of_a_thing_is_not_that_of_its_part():
+    assert understand("nose of the bear on the table").phrase == understand("bear nose on the table").phrase
+
+
 def test_every_word_of_the_vocabulary_names_a_thing_but_those_of_places():
     words = [*everyday_words(), *default_vocabulary(), *default_vocabulary("bundled")]
     assert {word for word in words if left_over(word)} == {"back", "edge"}

@@ -8,7 +8,7 @@ from functools import lru_cache
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.leftovers import NUMBERS, ORDINALS, left_over
 from lexsplat.queries.spelling import frame_errors
-from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, default_vocabulary
+from lexsplat.queries.vocabulary import COLORS, NAMES, PARTS, QUALITIES, default_vocabulary
 
 _I = r"(?:i|we|you|one|someone|somebody|anyone|anybody|they|he|she|it)"
 _CAN = r"(?:can|could|would|will|may|might|should|do|did|does)"
@@ -68,7 +68,15 @@ _NEGATIVE = re.compile(
     re.IGNORECASE,
 )
 """A negative question; it asks what its positive statement asks."""
+_OF_ITS_THING = re.compile(
+    rf"\b((?:{'|'.join(sorted(PARTS))})(?:e?s)?) of (?:(?:the|an?|my|your|this|that) )?"
+    r"((?:(?!(?:on|in|at|to|of|near|next|under|behind|beside|between|and|or|but|with|that|which|is|are)\b)[\w-]+ ){0,3}"
+    rf"(?:{'|'.join(sorted(NAMES))})s?)\b",
+    re.IGNORECASE,
+)
+"""A part of a thing: "the nose of the bear" asks for the bear nose."""
 _REWORDED = (
+    (_OF_ITS_THING, r"\2 \1"),
     (_NEGATIVE, r"\1 "),
     (re.compile(r"\b(everything|anything|nothing|all)( else)? besides\b", re.IGNORECASE), r"\1 except"),
     (
