@@ -1,5 +1,7 @@
 """Presence: on scenes where it is known which codes there are."""
 
+import dataclasses
+
 import pytest
 import torch
 from support.language_scene import make_scene
@@ -162,7 +164,9 @@ def test_a_part_is_there_only_with_its_thing(judge, monkeypatch, thing, presence
     (found,) = judge.evidence(["3 handle"], Words()(["3"]), torch.zeros(1, 500))
     assert found.presence == presence
     assert found.strength == (pytest.approx(1, abs=0.1) if presence == "yes" else 0)
-    assert found.yes == module.YES_PART < module.NO
+    assert (found.yes, found.no) == (module.YES_PART, module.NO_PART)
+    for strength, answer in ((found.no - 0.01, "no"), (found.no + 0.01, "unsure"), (found.yes + 0.01, "yes")):
+        assert dataclasses.replace(found, ratio=strength, height=strength).presence == answer
 
 
 def test_a_color_is_that_of_the_thing(judge):

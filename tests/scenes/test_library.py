@@ -17,7 +17,7 @@ import lexsplat
 from lexsplat import open_scene
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.grammar import understand
-from lexsplat.queries.presence import NO, YES_PART
+from lexsplat.queries.presence import NO_PART, NO_SEGMENT
 from lexsplat.queries.relevancy import gaussian_relevancy
 from lexsplat.runtime.errors import FileFormatError, LibraryError, QueryError, SceneFolderError
 from lexsplat.runtime.files import read_json, read_tensors, write_json, write_tensors
@@ -102,8 +102,8 @@ def test_no_scene_is_ruled_out_that_holds_the_thing():
     bounds = presence_bounds([Codes.of(scene)], scene.embed(words))[0]
     assert (bounds >= np.array(strengths) - 0.005).all()
     assert np.corrcoef(bounds, strengths)[0, 1] > 0.95
-    assert sum(strength >= NO for strength in strengths) > 2  # both kinds are among the words
-    assert (bounds < NO).sum() > 30
+    assert sum(strength >= NO_SEGMENT for strength in strengths) > 2  # both kinds are among the words
+    assert (bounds < NO_SEGMENT).sum() > 30
 
 
 def test_bounds_are_those_of_a_loop_in_float64():
@@ -144,7 +144,7 @@ def test_the_bound_of_a_phrase_follows_from_those_of_its_things(phrase, bound):
 
 
 def test_a_scene_is_not_ruled_out_for_a_part_that_it_may_hold():
-    for text, strength in (("mug handle", YES_PART), ("mug", NO), ("candle holder", NO)):
+    for text, strength in (("mug handle", NO_PART), ("mug", NO_SEGMENT), ("candle holder", NO_SEGMENT)):
         held, missing = (np.array([strength + change]) for change in (0.0, -0.02))
         phrase = understand(text).phrase
         assert float(phrase_bound(phrase, {text: held})[0]) >= SURELY_NOT

@@ -26,11 +26,13 @@ export interface EverydayRule {
   peak: number;
   yes: number;
   no: number;
-  /** Borders of "yes" for what is judged at segments and for phrases with a color; words that tell which is which. */
+  /** Borders for what is judged at segments, and of "yes" for phrases with a color; words that tell which is which. */
   yes_segment: number;
   yes_colored: number;
-  /** "Yes" for a part where its thing is described, and from which strength it is. */
+  no_segment: number;
+  /** "Yes" and "no" for a part where its thing is described, and from which strength it is. */
   yes_part: number;
+  no_part: number;
   at_thing: number;
   /** Ratios at which the relevancy of a part is 0.5: over everyday words, and over its thing. */
   border_part: number;

@@ -96,9 +96,9 @@ export function strengthsOf(heights: Heights, places: Float32Array, best: Float3
 }
 
 /** Whether the scene holds a phrase, from how well it describes each of some places. */
-export function presenceOf(strengths: number[], rule: EverydayRule, yes: number): Presence {
+export function presenceOf(strengths: number[], yes: number, no: number): Presence {
   const strength = strengths.reduce((most, value) => Math.max(most, value), 0);
-  return strength >= yes ? "yes" : strength < rule.no ? "no" : "unsure";
+  return strength >= yes ? "yes" : strength < no ? "no" : "unsure";
 }
 
 /** The `count` indices among `of` with the largest values, without sorting them all. */

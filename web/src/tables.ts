@@ -149,19 +149,20 @@ export class Tables implements Source {
     if (this.#shown.length === 0) return "no";
     if (!this.segments || !places || !colored) {
       const peak = peakOf(own, this.language, this.#shown, this.geometry.rule);
-      return presenceOf(strengthsOf(heights, peak, best, rule), rule, rule.yes);
+      return presenceOf(strengthsOf(heights, peak, best, rule), rule.yes, rule.no);
     }
     if (isPart(phrase, rule)) {
       this.#parts ??= this.segments.distributions(this.language);
       const strengths = strengthsOf(heights, this.#parts, best, rule);
-      if (!thing) return presenceOf(strengths, rule, rule.yes_segment);
-      const held = strengthsOf(thing.heights, places, thing.compared, rule).some((value) => value >= rule.no);
+      if (!thing) return presenceOf(strengths, rule.yes_segment, rule.no_segment);
+      const held = strengthsOf(thing.heights, places, thing.compared, rule).some((value) => value >= rule.no_segment);
       const there = strengthsOf(thing.heights, this.#parts, thing.compared, rule);
-      return presenceOf(held ? strengths.filter((_, place) => there[place] >= rule.at_thing) : [], rule, rule.yes_part);
+      const at = held ? strengths.filter((_, place) => there[place] >= rule.at_thing) : [];
+      return presenceOf(at, rule.yes_part, rule.no_part);
     }
     return hasColor(phrase, rule)
-      ? presenceOf(strengthsOf(heights, places, colored, rule), rule, rule.yes_colored)
-      : presenceOf(strengthsOf(heights, places, best, rule), rule, rule.yes_segment);
+      ? presenceOf(strengthsOf(heights, places, colored, rule), rule.yes_colored, rule.no)
+      : presenceOf(strengthsOf(heights, places, best, rule), rule.yes_segment, rule.no_segment);
   }
   #parts: Float32Array | null = null;
 

@@ -32,16 +32,18 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.segment_codes import SegmentCodes, codes_of_field
 from lexsplat.queries.everyday import BORDER, EverydayScale, everyday_words, peaks
-from lexsplat.queries.objects import FITS, whole_segments
+from lexsplat.queries.objects import whole_segments
 from lexsplat.queries.selection import Presence
 from lexsplat.queries.vocabulary import COLORS, has_color, is_part, thing_of_part
 
-YES, NO = 0.74, FITS
+YES, NO = 0.74, 0.6
 """Strengths from which the answer is "yes", and below which it is "no"."""
 YES_SEGMENT, YES_COLORED, YES_PART = 0.62, 0.82, 0.52
 """The former at objects, whose means are lower than peaks; for phrases with a color, which share the color or the
 name with most of what they are confused with; and for parts where their thing is described. Chosen on the second
-scene, with the bundled encoder and three of ``benchmarks/web_like.py``."""
+scene, with the bundled encoder and three of ``benchmarks/web_like.py``; the borders of "no" below with six of them."""
+NO_SEGMENT, NO_PART = 0.55, 0.45
+"""Lower borders of "no" at objects, for phrases without a color, and for parts where their thing is described."""
 AT_THING = 0.3
 """Strength of its thing at a place that may be a part of it."""
 
@@ -66,11 +68,13 @@ class Evidence:
         ratio: Height at the best place over that of the best everyday word there.
         height: Height at the best place over those of the scene's best described words.
         yes: Strength from which the answer is "yes".
+        no: Strength below which it is "no".
     """
 
     ratio: float
     height: float
     yes: float = YES
+    no: float = NO
 
     @property
     def strength(self) -> float:
@@ -80,7 +84,7 @@ class Evidence:
     @property
     def presence(self) -> Presence:
         """Whether the scene holds the phrase: "yes", "no" or "unsure"."""
-        return "yes" if self.strength >= self.yes else "no" if self.strength < NO else "unsure"
+        return "yes" if self.strength >= self.yes else "no" if self.strength < self.no else "unsure"
 
 
 class DescribedPlaces(NamedTuple):
@@ -155,21 +159,22 @@ class PresenceClassifier:
         heights = self.scale.heights(self.language.codebook.clip, texts)
         found = []
         for number, phrase in enumerate(phrases):
-            yes = YES
+            yes, no = YES, NO
             if self.language.segments is None:
                 places = self._peak(scores[number])[None]
             elif is_part(phrase) and (codes := self.segment_codes) is not None:
-                places, yes = codes.distributions, YES_SEGMENT
+                places, yes, no = codes.distributions, YES_SEGMENT, NO_SEGMENT
                 if thing := thing_of_part(phrase):
-                    places, yes = self._at_thing(thing, places), YES_PART
+                    places, yes, no = self._at_thing(thing, places), YES_PART, NO_PART
                 if not len(places):
-                    found.append(Evidence(0.0, 0.0, yes))
+                    found.append(Evidence(0.0, 0.0, yes, no))
                     continue
             else:
-                places, yes = self.places.distributions, YES_COLORED if has_color(phrase) else YES_SEGMENT
+                places = self.places.distributions
+                yes, no = (YES_COLORED, NO) if has_color(phrase) else (YES_SEGMENT, NO_SEGMENT)
             ratios, reached = self._compared(heights[:, number : number + 1], places, self._best(phrase))
             place = _strength(ratios, reached)[:, 0].argmax()
-            found.append(Evidence(float(ratios[place]), float(reached[place]), yes))
+            found.append(Evidence(float(ratios[place]), float(reached[place]), yes, no))
         return found
 
     @property
@@ -247,7 +252,7 @@ class PresenceClassifier:
             _strength(*self._compared(heights, each, best))[:, 0]
             for each in (self.places.distributions, places)
         )
-        return places[(at_places >= AT_THING) & (at_objects >= NO).any()]
+        return places[(at_places >= AT_THING) & (at_objects >= NO_SEGMENT).any()]
 
     def _peak(self, scores: Tensor) -> Tensor:
         """Mean distribution ``[K]`` over the codes of the Gaussians that score best."""

@@ -7,7 +7,7 @@ its strength is at most
     sqrt(max(0, p.h / p.b) max(0, p.h / peak)) <= max over k of h_k / sqrt(b_k peak)
 
 because p.h <= M sqrt(peak) p.sqrt(b) <= M sqrt(peak) sqrt(p.b) for the maximum M (Jensen). A scene whose bound is
-below `NO` does not hold the phrase, wherever its best place is: it need not be opened. Scenes are opened in the order
+below `NO_SEGMENT` does not hold the phrase, wherever its best place is: it need not be opened. Scenes are opened in the order
 of their bounds. Dimension letters: S scenes, K codes, D dimensions, P texts.
 """
 
@@ -23,14 +23,14 @@ from torch import Tensor
 
 from lexsplat.queries.everyday import OFFSET
 from lexsplat.queries.phrases import Anything, Both, Except, Phrase, Thing, Viewer, parts_of
-from lexsplat.queries.presence import NO, YES_PART
+from lexsplat.queries.presence import NO_PART, NO_SEGMENT
 from lexsplat.queries.vocabulary import thing_of_part
 from lexsplat.runtime.device import one_thread
 from lexsplat.scenes.library.entries import Codes
 
-SURELY_NOT = NO - 0.01
+SURELY_NOT = NO_SEGMENT - 0.01
 """Scenes with a smaller bound do not hold the phrase. Codes are kept in float16, which moves a bound by less than
-the difference to `NO`."""
+the difference to `NO_SEGMENT`."""
 CERTAIN = 2.0
 """The bound of a phrase without words to compare, such as "everything"."""
 
@@ -84,7 +84,9 @@ def phrase_bound(phrase: Phrase, of_thing: Mapping[str, FloatArray]) -> FloatArr
     A relation holds where all of its parts are present, a union where one is.
     """
     if isinstance(phrase, Thing):
-        lower = NO / YES_PART if thing_of_part(phrase.text) else 1.0  # a part is held from `YES_PART`
+        lower = (
+            NO_SEGMENT / NO_PART if thing_of_part(phrase.text) else 1.0
+        )  # a part may be held from `NO_PART`
         return lower * of_thing[phrase.text]
     if isinstance(phrase, (Anything, Viewer)):
         return CERTAIN
