@@ -7,8 +7,8 @@ its strength is at most
     sqrt(max(0, p.h / p.b) max(0, p.h / peak)) <= max over k of h_k / sqrt(b_k peak)
 
 because p.h <= M sqrt(peak) p.sqrt(b) <= M sqrt(peak) sqrt(p.b) for the maximum M (Jensen). A scene whose bound is
-below `NO_SEGMENT` does not hold the phrase, wherever its best place is: it need not be opened. Scenes are opened in the order
-of their bounds. Dimension letters: S scenes, K codes, D dimensions, P texts.
+below `NO_SEGMENT` does not hold the phrase, wherever its best place is: it need not be opened. Scenes are opened in
+the order of their bounds. Dimension letters: S scenes, K codes, D dimensions, P texts.
 """
 
 from __future__ import annotations
