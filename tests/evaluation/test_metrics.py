@@ -67,6 +67,15 @@ def test_lpips_states_why_it_is_unavailable(monkeypatch):
     assert "pip install 'lexsplat[lpips]'" in reason
 
 
+def test_without_torchvision_lpips_is_refused_before_torchmetrics_loads(monkeypatch):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "torchmetrics"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "torchvision", None)
+    function, reason = metrics.load_lpips()
+    assert function is None and "torchvision" in reason
+    assert not any(name.partition(".")[0] == "torchmetrics" for name in sys.modules)
+
+
 # Relevancy maps, strict protocol
 
 

@@ -36,8 +36,12 @@ class Gallery:
             "photo": self._jpeg(_to_bytes(view.photo)),
             "render": self._jpeg(_to_bytes(view.image)),
         }
+        shapes = {relevancy.shape for relevancy in view.relevancy.values()}
+        pictures = {
+            shape: tuple(_fit(_to_bytes(side), shape) for side in (view.image, view.photo)) for shape in shapes
+        }
         for prompt, relevancy in view.relevancy.items():
-            image, photo = (_fit(_to_bytes(side), relevancy.shape) for side in (view.image, view.photo))
+            image, photo = pictures[relevancy.shape]
             self.cases[view.name, prompt] = {
                 "heatmap": self._jpeg(overlay_heatmap(image, relevancy)),
                 "mask": self._jpeg(overlay_mask(image, relevancy >= view.thresholds[prompt])),
