@@ -13,7 +13,7 @@ from support.rendering_reference import blend, front_camera, project, random_gau
 from torch.nn.functional import normalize
 
 from lexsplat.codebook import CodebookConfig
-from lexsplat.features import FeatureMap
+from lexsplat.features import FeatureMap, FeatureMaps
 from lexsplat.language.fields import CodeField
 from lexsplat.language.methods import METHODS
 from lexsplat.language.methods.averaged import (
@@ -162,6 +162,16 @@ def test_less_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_pat
     np.testing.assert_allclose(np.asarray(found.means, float), np.asarray(whole.means, float), atol=1e-3)
     assert (received[-1].done, received[-1].total) == ({1: 21, 30 * 8 * 3: 9, 30 * 8 * 4: 6}[memory],) * 2
     assert list((tmp_path).rglob("*.*")) == []  # the file of the means has no name
+
+
+@pytest.mark.parametrize("memory", ["4GB", "100B"])
+def test_features_that_are_not_read_again_are_freed(memory, small, tmp_path) -> None:
+    maps = random_features(small.cameras)
+    kept = FeatureMaps(list(maps), maps.__getitem__)
+    average_features(
+        small.gaussians, small.cameras, kept, FULL_SIZE, memory=parse_bytes(memory), scratch=tmp_path
+    )
+    assert kept.cached_bytes == 0
 
 
 def test_known_labels_and_features_are_recovered(balls) -> None:

@@ -270,6 +270,7 @@ class _Builder:
             shutil.rmtree(self._checkpoints / "blocks", ignore_errors=True)
         if self._maps is not None:
             self._maps.forget()  # the next stage needs the memory of the features kept so far
+        budget.give_back_freed()
 
     # -- the work of each stage
 

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.features import FeatureMap
+from lexsplat.features import FeatureMap, FeatureMaps
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import check_views
@@ -137,6 +137,8 @@ def average_features(
             if columns.start == 0:
                 totals += weights.to(sums.device)
             done += views
+            if columns is ranges[-1] and isinstance(feature_maps, FeatureMaps):
+                feature_maps.forget()  # nothing reads them again, and all of them are hundreds of megabytes
             listener(Event("average", done, len(ranges) * len(names), workers.metrics))
         for start in range(0, count, ROWS):
             rows = slice(start, start + ROWS)
