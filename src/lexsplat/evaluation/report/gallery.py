@@ -38,7 +38,8 @@ class Gallery:
         }
         shapes = {relevancy.shape for relevancy in view.relevancy.values()}
         pictures = {
-            shape: tuple(_fit(_to_bytes(side), shape) for side in (view.image, view.photo)) for shape in shapes
+            shape: tuple(_fit(_to_bytes(side), shape) for side in (view.image, view.photo))
+            for shape in shapes
         }
         for prompt, relevancy in view.relevancy.items():
             image, photo = pictures[relevancy.shape]

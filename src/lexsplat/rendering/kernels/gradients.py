@@ -156,14 +156,16 @@ def _pair_gradients(
         row_alpha = alpha_of(across + down * dy * dy, slope, dy, opacity)
         row_alpha = select_greater(load(last_pairs, (tile * TILE + j) * TILE), number, row_alpha, ZERO)
         if not any_positive(row_alpha):
-            store(weights, j * TILE, zeros)
+            if channels > colors:
+                store(weights, j * TILE, zeros)
             continue
         touched = True
         inverse = ONE / (ONE - row_alpha)
         before = load(live, j * TILE) * inverse
         store(live, j * TILE, before)
         weight = row_alpha * before
-        store(weights, j * TILE, weight)
+        if channels > colors:
+            store(weights, j * TILE, weight)
         dots = zeros
         if colors == 3:
             place = j * channels * TILE
