@@ -214,7 +214,15 @@ def test_an_incomplete_checkpoint_is_refused(capture, points):
 
 @pytest.mark.parametrize(
     "change",
-    [{"iterations": 0}, {"ssim_weight": 1.5}, {"sh_degree": 5}, {"warm_up": -0.1}, {"initial_opacity": 1.0}],
+    [
+        {"iterations": 0},
+        {"ssim_weight": 1.5},
+        {"sh_degree": 5},
+        {"warm_up": -0.1},
+        {"initial_opacity": 1.0},
+        {"cool_down": 1.1},
+        {"renewal": 1.0},
+    ],
 )
 def test_settings_out_of_range_are_named(change):
     (name,) = change
@@ -227,6 +235,8 @@ def test_the_full_length_uses_the_rates_and_schedule_of_3dgs():
     expected = {"means": 3.2e-4, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5e-2, "sh0": 2.5e-3}
     assert config.rates(extent=2.0) == pytest.approx({**expected, "shN": 2.5e-3 / 20})
     assert config.warm_up_iterations == 0
+    assert config.renewed_share == 0
+    assert config.cooling(29_999) == 1.0
     assert config.is_long
 
 
@@ -235,7 +245,59 @@ def test_short_trainings_use_higher_rates_and_start_at_low_resolution():
     assert config.rates(1.0)["means"] == pytest.approx(2 * 1.6e-4)
     assert config.rates(1.0)["opacity_logits"] == 5e-2
     assert config.warm_up_iterations == 1_125
+    assert config.renewed_share == 0.15
     assert not config.is_long
+
+
+@pytest.mark.parametrize(("renewal", "left"), [(None, 0), (0.15, 0), (0.0, 20)])
+def test_rounds_at_the_cap_replace_the_gaussians_that_no_view_shows(capture, points, renewal, left):
+    far = np.full((20, 3), 1e4, np.float32)  # beyond everything, and outside of every view
+    started = dataclasses.replace(
+        points,
+        points=np.concatenate([points.points, far]),
+        colors=np.concatenate([points.colors, np.zeros_like(far)]),
+    )
+    config = dataclasses.replace(SHORT, renewal=renewal, max_gaussians=len(started.points))
+    trainer = Reconstructor(capture, config, started)
+    for _ in range(5):
+        trainer.step()
+    assert count_far(trainer) == 20, "the first round is after the fifth step"
+    trainer.step()
+    assert count_far(trainer) == left
+    assert len(trainer.gaussians()) <= config.max_gaussians
+
+
+def test_below_the_cap_nothing_is_replaced(capture, points):
+    trainer = Reconstructor(capture, dataclasses.replace(SHORT, max_gaussians=100_000), points)
+    for _ in range(5):
+        trainer.step()
+    assert trainer._density.number_to_renew(5) == 0
+
+
+def count_far(trainer) -> int:
+    return int((trainer.gaussians().means > 1e3).all(1).sum())
+
+
+def test_rates_fall_linearly_to_a_twentieth_at_the_end_of_a_short_training():
+    config = ReconstructionConfig(iterations=1_000)
+    steps = [0, 750, 800, 875, 975, 990, 1_000]
+    assert [config.cooling(step) for step in steps] == pytest.approx([1, 1, 0.8, 0.5, 0.1, 0.05, 0.05])
+    assert dataclasses.replace(config, cool_down=0.0).cooling(1_000) == 1.0
+
+
+def test_all_optimizers_follow_the_cool_down_also_after_a_resume(capture, points):
+    config = dataclasses.replace(SHORT, cool_down=0.5)
+    trainer, resumed = (Reconstructor(capture, config, points) for _ in range(2))
+    for _ in range(SHORT.iterations - 5):
+        trainer.step()
+    resumed.load_state_dict(trainer.state_dict())
+    plain = config.rates(trainer._extent)
+    for each in (trainer, resumed):
+        each.step()
+        groups = {name: optimizer.param_groups[0] for name, optimizer in each._optimizers.items()}
+        cooled = {name: plain[name] * 5 / 12 for name in plain if name != "means"}
+        assert {name: groups[name]["lr"] for name in cooled} == pytest.approx(cooled)
+        assert groups["means"]["lr"] < plain["means"] * 5 / 12
 
 
 def test_explicit_settings_take_precedence():
@@ -246,7 +308,7 @@ def test_explicit_settings_take_precedence():
 
 
 def test_the_learning_rate_of_the_means_decays_to_a_hundredth(capture, points):
-    trainer = Reconstructor(capture, SHORT, points)
+    trainer = Reconstructor(capture, dataclasses.replace(SHORT, cool_down=0.0), points)
     first = trainer._means_rate()
     trainer.steps_done = SHORT.iterations
     assert trainer._means_rate() == pytest.approx(first / 100)

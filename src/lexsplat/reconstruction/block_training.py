@@ -140,7 +140,9 @@ class VisitReconstructor(Reconstructor):
     ) -> None:
         self._visit, self._state, self._order_of_views = visit, state, visit.views(seed)
         # Gaussians are added and removed between the visits.
-        config = replace(config, densify_every=_NEVER, densify_min_every=_NEVER, reset_opacities=False)
+        config = replace(
+            config, densify_every=_NEVER, densify_min_every=_NEVER, reset_opacities=False, cool_down=0.0
+        )
         own = _seed(seed, visit.number)
         super().__init__(capture, config, None, seed=own, **options)  # type: ignore[arg-type]
         self._photo_folder = photos

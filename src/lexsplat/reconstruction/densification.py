@@ -27,6 +27,9 @@ NEVER = 1 << 62
 MAX_COPIES = 51
 """Upper limit of the copies of one Gaussian; larger numbers are clamped to it, as in gsplat."""
 
+RENEWAL_START = 0.2
+"""Share of the iterations after which rounds make room for others: before it, all Gaussians are still growing."""
+
 GSPLAT_NAMES = {"log_scales": "scales", "opacity_logits": "opacities"}
 """Parameters that gsplat's strategies expect under another name."""
 
@@ -92,6 +95,7 @@ class DensityControl:
         radii: Tensor,
         image_size: tuple[int, int],
         means_learning_rate: float,
+        idle: Tensor | None = None,
     ) -> bool:
         """Add, move and remove Gaussians after the optimizers' step; replaces entries of ``parameters``.
 
@@ -103,6 +107,7 @@ class DensityControl:
             radii: Size on screen ``[N]`` or ``[C, N]`` in pixels; 0 where not drawn.
             image_size: Width and height of the rendered image.
             means_learning_rate: Present learning rate of the means; scales the noise of "mcmc".
+            idle: Mask ``[N]`` of Gaussians that a round of "default" removes before it adds others.
 
         Returns:
             Whether the set of Gaussians changed.
@@ -120,6 +125,8 @@ class DensityControl:
             elif step < self.schedule.stop:
                 self._accumulate(means2d, radii, image_size)
                 if changed:
+                    if idle is not None:
+                        self._remove(subjects, idle)
                     self._refine(subjects, step)
                 if self.config.resets_opacities and step > 0 and step % self.schedule.reset_every == 0:
                     self._reset_opacities(subjects)
@@ -170,6 +177,11 @@ class DensityControl:
         nothing = _nothing_visible(count, self._device)
         self._strategy.step_post_backward(*subjects, self._state, step, nothing)
 
+    def _remove(self, subjects: tuple[dict[str, Any], dict[str, Any]], mask: Tensor) -> None:
+        from gsplat.strategy import ops
+
+        ops.remove(*subjects, self._state, mask)
+
     def _reset_opacities(self, subjects: tuple[dict[str, Any], dict[str, Any]]) -> None:
         from gsplat.strategy import ops
 
@@ -192,6 +204,15 @@ class DensityControl:
     def refines_at(self, step: int) -> bool:
         """Whether `step` changes the set of Gaussians after ``step`` finished steps."""
         return self.schedule.start < step < self.schedule.stop and step % self.schedule.every == 0
+
+    def number_to_renew(self, step: int) -> int:
+        """Number of Gaussians that a round after ``step`` finished steps removes to make room below the cap."""
+        share, sums = self.config.renewed_share, self._state.get("grad2d")
+        if sums is None or not self.refines_at(step) or step < RENEWAL_START * self.config.iterations:
+            return 0
+        gradients = sums / self._state["count"].clamp_min(1)
+        wanted = int((gradients > self.config.grow_gradient).sum())
+        return max(0, min(int(share * len(sums)), wanted - (self._cap - len(sums))))
 
     def _threshold_within_cap(self, count: int) -> float:
         """The lowest threshold, not below the configured one, that keeps the number within the cap."""

@@ -18,6 +18,10 @@ LONG_TRAINING = 15_000
 """Trainings of this length reset opacities and run entirely at full resolution, unless a setting overrides it."""
 
 
+COOLEST = 0.05
+"""Factor of all learning rates at the end of the cool-down."""
+
+
 @dataclass(frozen=True)
 class DensitySchedule:
     """Steps at which density control acts.
@@ -51,6 +55,9 @@ class ReconstructionConfig:
             contribute to each decision.
         grow_gradient: Mean gradient of projected centers, in halves of the image, above which "default" adds
             Gaussians.
+        renewal: Most Gaussians that a round of "default" replaces at the upper limit, as a share of all: those of the
+            least blending weight over the training views go where others ask for more room, from a fifth of the
+            iterations on. None is 0.15 in trainings shorter than 15,000, else 0.
         min_opacity: Gaussians below this opacity are removed ("default") or moved ("mcmc").
         reset_opacities: Whether "default" lowers all opacities every 3,000 steps to twice ``min_opacity``, and after
             the first reset removes Gaussians larger than a tenth of the scene; None enables it from 15,000
@@ -62,6 +69,9 @@ class ReconstructionConfig:
         initial_opacity: Opacity of the initial Gaussians.
         warm_up: Share of the iterations, at the start, that run at half resolution; None is 0.3 in trainings
             shorter than 15,000, else 0.
+        cool_down: Share of the iterations, at the end, over which all learning rates fall linearly to a twentieth, so
+            that the last views do not count for more than the others; None is 0.25 in trainings shorter than 15,000,
+            else 0.
         exposure: Fit an affine color change per training photo, for captures whose exposure varies.
         rate_scale: Factor of all learning rates but that of the opacities; None is the cube root of
             30,000 / iterations, between 1 and 3, so that a short training takes larger steps.
@@ -84,6 +94,7 @@ class ReconstructionConfig:
     densify_every: int = 100
     densify_min_every: int = 100
     grow_gradient: float = 2e-4
+    renewal: float | None = None
     min_opacity: float = 0.005
     reset_opacities: bool | None = None
     noise: float = 5e5
@@ -92,6 +103,7 @@ class ReconstructionConfig:
     antialiased: bool = True
     initial_opacity: float = 0.1
     warm_up: float | None = None
+    cool_down: float | None = None
     exposure: bool = False
     rate_scale: float | None = None
     means_rate: float = 1.6e-4
@@ -116,6 +128,10 @@ class ReconstructionConfig:
             raise ValueError(f"sh_degree must be in 0..4, got {self.sh_degree}")
         if self.warm_up is not None and not 0 <= self.warm_up <= 1:
             raise ValueError(f"warm_up must be in 0..1, got {self.warm_up:g}")
+        if self.cool_down is not None and not 0 <= self.cool_down <= 1:
+            raise ValueError(f"cool_down must be in 0..1, got {self.cool_down:g}")
+        if self.renewal is not None and not 0 <= self.renewal < 1:
+            raise ValueError(f"renewal must be in [0, 1), got {self.renewal:g}")
         if not 0 < self.initial_opacity < 1:
             raise ValueError(f"initial_opacity must be between 0 and 1, got {self.initial_opacity:g}")
 
@@ -154,6 +170,20 @@ class ReconstructionConfig:
         """Number of iterations at half resolution."""
         share = (0.0 if self.is_long else 0.3) if self.warm_up is None else self.warm_up
         return round(share * self.iterations)
+
+    def cooling(self, step: int) -> float:
+        """Factor of all learning rates after ``step`` finished steps: 1, and below it in the cool-down."""
+        share = (0.0 if self.is_long else 0.25) if self.cool_down is None else self.cool_down
+        if share == 0:
+            return 1.0
+        return min(1.0, max(COOLEST, (self.iterations - step) / (share * self.iterations)))
+
+    @property
+    def renewed_share(self) -> float:
+        """`renewal`, with its default."""
+        if self.strategy != "default":
+            return 0.0
+        return (0.0 if self.is_long else 0.15) if self.renewal is None else self.renewal
 
     @property
     def regularizers(self) -> tuple[float, float]:

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 STAGE = "reconstruct"
 """Name of the stage in events."""
+WEIGHED_VIEWS = 24
+"""Training views, evenly chosen, that decide which Gaussians are renewed."""
 EVENT_EVERY = 10
 """Iterations between two events."""
 PHOTO_BYTES_MAX = 1 << 30
@@ -211,6 +213,7 @@ class Reconstructor:
         To track them, an index that is never trained is copied, split and removed along with the parameters.
         Indices are exact in float32 up to 16 million.
         """
+        number = self._density.number_to_renew(self.steps_done)
         tracked = self.tracks_origins and self._density.refines_at(self.steps_done)
         if tracked:
             indices = torch.arange(len(self._parameters["means"]), dtype=torch.float32, device=self.device)
@@ -224,11 +227,25 @@ class Reconstructor:
             radii=radii,
             image_size=image_size,
             means_learning_rate=self._means_rate(),
+            idle=self._of_least_weight(number) if number else None,
         )
         self.origins = None
         if tracked:
             del self._optimizers["origins"]
             self.origins = self._parameters.pop("origins").detach().long()
+
+    def _of_least_weight(self, number: int) -> Tensor:
+        """Mask of the ``number`` Gaussians of the least blending weight, summed over evenly chosen views."""
+        from lexsplat.rendering import accumulate_weights
+
+        gaussians = self.gaussians()
+        weights = torch.zeros(len(gaussians), device=self.device)
+        places = torch.linspace(0, len(self._names) - 1, WEIGHED_VIEWS).round().long().unique().tolist()
+        for place in places:
+            weights += accumulate_weights(gaussians, self._views[self._names[place]].camera)
+        mask = torch.zeros(len(weights), dtype=torch.bool, device=self.device)
+        mask[torch.argsort(weights, stable=True)[:number]] = True
+        return mask
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything needed to continue bit for bit, as named tensors."""
@@ -283,7 +300,8 @@ class Reconstructor:
         return {name: adam(self._parameters[name], rate) for name, rate in self._rates().items()}
 
     def _rates(self) -> dict[str, float]:
-        return {name: rate * self._rate_factor for name, rate in self.config.rates(self._extent).items()}
+        factor = self._rate_factor * self.config.cooling(self.steps_done)
+        return {name: rate * factor for name, rate in self.config.rates(self._extent).items()}
 
     def _as_gaussians(self) -> Gaussians:
         return Gaussians(**self._parameters, antialiased=self.config.antialiased)
@@ -356,7 +374,8 @@ class Reconstructor:
             )
 
     def _optimize(self) -> None:
-        self._optimizers["means"].param_groups[0]["lr"] = self._means_rate()
+        for name, rate in (self._rates() | {"means": self._means_rate()}).items():
+            self._optimizers[name].param_groups[0]["lr"] = rate
         if self._active_sh_degree() == 0:
             self._parameters["shN"].grad = None
         for optimizer in self._optimizers.values():
