@@ -72,7 +72,8 @@ def test_without_torchvision_lpips_is_refused_before_torchmetrics_loads(monkeypa
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torchvision", None)
     function, reason = metrics.load_lpips()
-    assert function is None and "torchvision" in reason
+    assert function is None
+    assert "torchvision" in reason
     assert not any(name.partition(".")[0] == "torchmetrics" for name in sys.modules)
 
 

@@ -12,7 +12,7 @@ from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureConfig
 from lexsplat.language.methods.averaged import AveragedConfig
 from lexsplat.language.methods.trained_settings import TrainedConfig
-from lexsplat.pipeline.config import CPU_ITERATIONS, CPU_PIXELS, BuildConfig
+from lexsplat.pipeline.config import BLOCKS_ITERATIONS, CPU_ITERATIONS, CPU_PIXELS, BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import BackendError
@@ -50,6 +50,7 @@ def test_given_settings_are_kept():
 
 def test_the_number_of_steps_suits_the_device():
     assert BuildConfig().resolved("cpu", (10, 10)).reconstruction.iterations == CPU_ITERATIONS
+    assert BuildConfig(blocks="4").resolved("cpu", (10, 10)).reconstruction.iterations == BLOCKS_ITERATIONS
     assert BuildConfig().resolved("cuda", (10, 10)).reconstruction.iterations == 30_000
 
 

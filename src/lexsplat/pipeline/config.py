@@ -30,6 +30,8 @@ CUDA_PIXELS = 2_000_000
 """Pixels of the working images on CUDA if no downscale is given: 1600 wide at 4:3, as in 3DGS."""
 CPU_ITERATIONS = 2_250
 """Reconstruction steps on a CPU if none are given."""
+BLOCKS_ITERATIONS = 3_000
+"""The same for a reconstruction in blocks, which replaces no Gaussians: fewer steps were not measured there."""
 PAPER_ITERATIONS = 30_000
 """Reconstruction steps of the paper."""
 CUDA_ITERATIONS = PAPER_ITERATIONS
@@ -59,7 +61,7 @@ class BuildConfig:
         checkpoint_seconds: Seconds between two checkpoints of a training.
         downscale: Factor by which photos are reduced for reconstruction and language; by default what suits the
             device.
-        iterations: Reconstruction steps; by default 30,000 on CUDA and 2,250 on a CPU.
+        iterations: Reconstruction steps; by default 30,000 on CUDA and 2,250 on a CPU (3,000 with ``blocks``).
         frames: Number of frames sampled from a video.
         test_every: Every n-th view is held out if the capture does not list held-out views; 0 holds out none.
         up: Up direction in the axes of the cameras, as "x,y,z"; by default estimated from the cameras, or
@@ -215,7 +217,8 @@ class BuildConfig:
         if iterations is None and self.reconstruction.iterations != ReconstructionConfig.iterations:
             iterations = self.reconstruction.iterations  # set from Python
         if iterations is None:
-            iterations = CPU_ITERATIONS if device == "cpu" else CUDA_ITERATIONS
+            steps = CPU_ITERATIONS if self.blocks == "none" else BLOCKS_ITERATIONS
+            iterations = steps if device == "cpu" else CUDA_ITERATIONS
         return replace(
             self,
             device=device,  # type: ignore[arg-type]
