@@ -80,7 +80,8 @@ class PartReconstructor(Reconstructor):
             config,
             iterations=math.ceil(config.iterations / self._ranks),
             max_gaussians=math.ceil(config.cap(torch.device(device)) / self._ranks),
-            renewal=0.0,  # the weights of a part alone would not know what the others hide
+            # The weights of a part alone would not know what the other parts hide.
+            renewal=config.renewal if self._ranks == 1 else 0.0,
         )
         super().__init__(capture, part, own, device=device, seed=seed + self._rank, memory=memory)
         self._generator = torch.Generator().manual_seed(seed)  # one order of views in all processes

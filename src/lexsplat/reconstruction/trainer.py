@@ -214,6 +214,7 @@ class Reconstructor:
         Indices are exact in float32 up to 16 million.
         """
         number = self._density.number_to_renew(self.steps_done)
+        idle = self._of_least_weight(number) if number else None
         tracked = self.tracks_origins and self._density.refines_at(self.steps_done)
         if tracked:
             indices = torch.arange(len(self._parameters["means"]), dtype=torch.float32, device=self.device)
@@ -227,7 +228,7 @@ class Reconstructor:
             radii=radii,
             image_size=image_size,
             means_learning_rate=self._means_rate(),
-            idle=self._of_least_weight(number) if number else None,
+            idle=idle,
         )
         self.origins = None
         if tracked:
