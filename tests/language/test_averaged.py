@@ -167,7 +167,16 @@ def test_less_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_pat
 @pytest.mark.parametrize("memory", ["4GB", "100B"])
 def test_features_that_are_not_read_again_are_freed(memory, small, tmp_path) -> None:
     maps = random_features(small.cameras)
-    kept = FeatureMaps(list(maps), maps.__getitem__)
+    loaded = []
+
+    def load(name: str) -> FeatureMap:
+        loaded.append(name)
+        return maps[name]
+
+    kept = FeatureMaps(list(maps), load)
+    assert "nobody" not in kept
+    assert all(name in kept for name in maps)
+    assert loaded == [], "whether there is a map is answered without loading it"
     average_features(
         small.gaussians, small.cameras, kept, FULL_SIZE, memory=parse_bytes(memory), scratch=tmp_path
     )

@@ -90,6 +90,9 @@ class FeatureMaps(Mapping[str, FeatureMap]):
                 self._kept.popitem(last=False)
         return found
 
+    def __contains__(self, name: object) -> bool:
+        return name in self._names  # that of Mapping would load the map
+
     def forget(self) -> None:
         """Free the kept maps; they are loaded again on access."""
         with self._lock:
