@@ -85,6 +85,7 @@ class DensityControl:
             )
             self._state = self._strategy.initialize_state(scene_scale=extent)
 
+    # What a rule may read of a step, and what it changes.
     def step(
         self,
         parameters: dict[str, torch.nn.Parameter],
