@@ -72,7 +72,7 @@ def features(views: int, scenes: int) -> Iterator[Tasks]:
 
 @contextmanager
 def averages(views: int, scenes: int) -> Iterator[Tasks]:
-    """Each shard of 16 views is a task, all of them three times; features are of one crop size."""
+    """Each shard of 16 views is a task, sixteen times over; features are of one crop size."""
     capture = load_capture(demo_capture())
     names = list(capture.train_names)[:views]
     capture = replace(
@@ -94,7 +94,7 @@ def averages(views: int, scenes: int) -> Iterator[Tasks]:
         shards = averaging.view_shards(names)
         items = {
             f"{shard[0]}, {i}": (shard, range(dimensions), dimensions, None)
-            for i in range(3)
+            for i in range(16)
             for shard in shards
         }
         yield averaging._shard_sums, shared, items
