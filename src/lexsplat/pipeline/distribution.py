@@ -195,11 +195,8 @@ def build_scenes(
                 failed += outcome.error is not None
                 send(Event("finished" if outcome.error is None else "failed", 1, 1, scene=outcome.name))
                 yield outcome
-                send(
-                    Event(
-                        "scenes", done, len(tasks), workers.metrics | ({"failed": failed} if failed else {})
-                    )
-                )
+                metrics = workers.metrics | ({"failed": failed} if failed else {})
+                send(Event("scenes", done, len(tasks), metrics))
 
 
 def _build_scene(shared: _Scenes, task: SceneTask) -> list[str]:

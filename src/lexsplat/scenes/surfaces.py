@@ -45,7 +45,7 @@ _REACH = 3.0
 _VIEWS, _LONG_SIDE = 16, 240
 """Number and longer side of the views that are looked at."""
 _BEFORE = 0.2
-"""Least coverage of a pixel by the thing, at which it hides what lies behind."""
+"""Share of a pixel from which the thing in it hides what lies behind."""
 
 
 class Surface(NamedTuple):
