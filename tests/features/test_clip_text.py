@@ -119,7 +119,7 @@ def test_the_text_tower_of_a_loaded_encoder_is_that_of_its_files_and_does_not_ho
 
 def test_an_encoder_of_another_architecture_answers_texts_without_its_image_tower(clip_folder, tmp_path):
     whole = load_clip(str(changed_config(clip_folder, tmp_path / "other", hidden_act="relu")))
-    expected, images = whole.encode_text(TEXTS), weakref.ref(whole._model.vision_model)
+    expected, images = whole.encode_text(TEXTS), weakref.ref(whole._images)
     texts = whole.text_only("cpu")
     gc.collect()
     assert images() is None

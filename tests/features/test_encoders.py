@@ -16,7 +16,8 @@ from PIL import Image
 from support.encoder_folders import MEAN, STD, save_model, seeded, tiny_vit
 
 from lexsplat.features import hub, pretrained
-from lexsplat.features.clip import _plain_attention, check_patches
+from lexsplat.features.clip import check_patches
+from lexsplat.features.clip_image import ClipImages
 from lexsplat.features.dino import _ramp, _window_starts
 from lexsplat.features.encoders import ClipEncoder, DinoEncoder, load_clip, load_dino, resize_images
 from lexsplat.runtime.errors import ModelError
@@ -55,16 +56,6 @@ def test_bfloat16_is_chosen_by_its_time_where_the_processor_has_instructions(fla
     monkeypatch.setattr(pretrained, "_has_bfloat16", lambda: flag)
     monkeypatch.setattr(pretrained.time, "thread_time", lambda: next(clock))
     assert pretrained.bfloat16_is_faster.__wrapped__() is chosen
-
-
-def test_only_image_towers_of_few_patches_use_eager_attention():
-    clip = load_clip("bundled")
-    assert clip._model.vision_model.config._attn_implementation == "eager"
-    assert clip._model.text_model.config._attn_implementation == "sdpa"
-    clip._model.vision_model.config._attn_implementation = "sdpa"
-    _plain_attention(clip._model, clip._model.config.vision_config, 8 * 14)
-    assert clip._model.vision_model.config._attn_implementation == "sdpa", "14 x 14 patches are not few"
-    _plain_attention(torch.nn.Linear(2, 2), object(), 48)  # another architecture is unchanged
 
 
 def _normalized(images: torch.Tensor) -> torch.Tensor:
@@ -112,6 +103,25 @@ def test_clip_image_embeddings_equal_transformers_own(clip_folder):
         expected = _unit(model.visual_projection(pooled))
     assert (encoder.image_size, encoder.dim) == (40, 20)
     torch.testing.assert_close(encoder.encode_images(images), expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("activation", "size"), [("quick_gelu", 24), ("gelu", 24), ("relu", 24), ("gelu", 72)]
+)
+def test_the_image_tower_equals_transformers_own(activation, size):
+    from transformers import CLIPConfig, CLIPModel, CLIPVisionConfig
+
+    vision = {"hidden_size": 24, "intermediate_size": 40, "num_attention_heads": 3, "num_hidden_layers": 3}
+    vision |= {"image_size": size, "patch_size": 8, "hidden_act": activation}
+    config = CLIPConfig(vision_config=CLIPVisionConfig(**vision).to_dict(), projection_dim=16)
+    model = seeded(lambda: CLIPModel(config))
+    pixels = torch.randn(3, 3, size, size)
+    with torch.no_grad():
+        expected = model.visual_projection(model.vision_model(pixel_values=pixels).pooler_output)
+        found, whole = (ClipImages(model)(pixels, patches=patches) for patches in (True, False))
+    assert (found.shape, whole.shape) == ((3, 1 + (size // 8) ** 2, 16), (3, 1, 16))
+    torch.testing.assert_close(found[:, 0], expected, atol=1e-4, rtol=1e-5)
+    torch.testing.assert_close(whole[:, 0], expected, atol=1e-4, rtol=1e-5)
 
 
 def test_patches_are_the_values_of_the_last_attention_layer(clip_folder):

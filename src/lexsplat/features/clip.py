@@ -5,10 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import logging
-import math
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -17,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lexsplat.features.clip_image import ClipImages
 from lexsplat.features.clip_text import UNLIKE, UNLIKE_WORDS, ClipText, light_tower
 from lexsplat.features.hub import local_folder
 from lexsplat.features.portable import TextWeights, tokenizer_content
@@ -38,7 +36,6 @@ _HALF = (0.5, 0.5, 0.5)
 _TEXT_BATCH = 64
 _ACTIVATIONS = ("quick_gelu", "gelu", "gelu_pytorch_tanh")
 """Of text towers that other programs can compute."""
-_FEW_PATCHES = 64
 _PADDING = 128  # vocabularies are padded to a multiple of at most this
 
 
@@ -57,12 +54,12 @@ class ClipEncoder(PretrainedModel):
             )
         self._siglip = config.model_type.startswith("siglip")
         self.image_size = _image_size(config.vision_config)
-        if self.device.type == "cpu":
-            _plain_attention(self._model, config.vision_config, self.image_size)
         self._text_length = int(config.text_config.max_position_embeddings)
         default = (_HALF, _HALF) if self._siglip else (_CLIP_MEAN, _CLIP_STD)
         self._mean, self._std = normalization(folder, default, self.device)
-        self._patches = _PatchReader(self._model) if config.model_type == "clip" else None
+        self._images = None
+        if config.model_type == "clip":
+            self._images, self._model.vision_model = ClipImages(self._model), None
         self._tokenizer = _load_tokenizer(folder, name, config)
         words = self.encode_text(UNLIKE_WORDS)
         self.dim = int(words.shape[-1])
@@ -77,25 +74,22 @@ class ClipEncoder(PretrainedModel):
     def encode_images(self, images: Tensor) -> Tensor:
         """``[B, 3, h, w]`` in 0..1, of any size, to ``[B, D]``, float32 on the CPU, unit length."""
         check_images(images)
-        images = resize_images(images.to(self.device, torch.float32), self.image_size, self.image_size)
-        pixels = (images - self._mean) / self._std
-        inputs = self._vision_inputs(pixels)
-        features = self._finite(lambda: _pooled(self._model.get_image_features(**inputs)), crops=True)
+        pixels = self._pixels(images)
+        if (tower := self._images) is not None:
+            features = self._finite(lambda: tower(pixels, patches=False)[:, 0], crops=True)
+        else:
+            inputs = self._vision_inputs(pixels)
+            features = self._finite(lambda: _pooled(self._model.get_image_features(**inputs)), crops=True)
         return F.normalize(features.float(), dim=-1).cpu()
 
     @property
     def patches(self) -> int:
         """Patches along a side of an image in `encode_patches`; 0 for architectures it does not support."""
-        if self._patches is None:
-            return 0
-        return self.image_size // int(self._model.config.vision_config.patch_size)
+        return 0 if self._images is None else self._images.patches
 
     @torch.inference_mode()
     def encode_patches(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Embeddings of images and of each of their patches, from one forward pass.
-
-        The embedding of a patch is that of MaskCLIP (Zhou, Loy and Dai, "Extract free dense labels from CLIP", ECCV
-        2022): the value vector of the last attention layer, projected like the class token.
 
         Args:
             images: ``[B, 3, h, w]`` in 0..1, of any size.
@@ -107,17 +101,17 @@ class ClipEncoder(PretrainedModel):
         Raises:
             ModelError: If the model is not of CLIP's own architecture.
         """
-        if self._patches is None:
+        check_images(images)
+        if (tower := self._images) is None:
             raise self._refusal(
                 "a model of CLIP's architecture for patch-level embeddings",
                 "use image-level embeddings only: `--features.crop-tokens class`",
             )
-        reader = self._patches
-        with reader.captured() as tokens:
-            whole = self.encode_images(images)
-        values = self._finite(lambda: reader.read(tokens[-1]), crops=True)
-        side = math.isqrt(values.shape[1])
-        return whole, F.normalize(values.float(), dim=-1).cpu().unflatten(1, (side, side))
+        pixels = self._pixels(images)
+        found = F.normalize(
+            self._finite(lambda: tower(pixels, patches=True), crops=True).float(), dim=-1
+        ).cpu()
+        return found[:, 0], found[:, 1:].unflatten(1, (tower.patches, tower.patches))
 
     @torch.inference_mode()
     def encode_text(self, prompts: Sequence[str]) -> Tensor:
@@ -144,7 +138,7 @@ class ClipEncoder(PretrainedModel):
         """
         light = light_tower(self._folder, self._model.state_dict, device)
         if light is None:
-            self._model.vision_model = self._patches = None
+            self._model.vision_model = self._images = None
             return self
         light.content_hash = self.content_hash
         return light
@@ -200,6 +194,11 @@ class ClipEncoder(PretrainedModel):
         if len(prompt) + 2 <= self._text_length:
             return 0
         return max(len(self._tokenizer(prompt, verbose=False)["input_ids"]) - self._text_length, 0)
+
+    def _pixels(self, images: Tensor) -> Tensor:
+        """Normalized pixels ``[B, 3, S, S]`` of the model's size."""
+        images = resize_images(images.to(self.device, torch.float32), self.image_size, self.image_size)
+        return (images - self._mean) / self._std
 
     def _vision_inputs(self, pixels: Tensor) -> dict[str, Tensor]:
         """Input of the image tower: pixels, or a list of patches for SigLIP 2 of variable size ("NaFlex")."""
@@ -288,52 +287,9 @@ def patch_grid(name: str) -> int:
     return max(0, grid) if config.get("model_type") == "clip" else 0
 
 
-class _PatchReader:
-    """Captures the input of the last attention layer of a CLIP image tower, per thread."""
-
-    def __init__(self, model: Any) -> None:
-        self._tower, self._project = model.vision_model, model.visual_projection
-        self._last = self._tower.encoder.layers[-1]
-        self._caught = threading.local()
-        self._last.layer_norm1.register_forward_hook(self._catch)
-
-    @contextmanager
-    def captured(self) -> Iterator[list[Tensor]]:
-        """A list that receives the tokens ``[B, 1 + P * P, width]`` of this thread's forward passes."""
-        tokens: list[Tensor] = []
-        self._caught.tokens = tokens
-        try:
-            yield tokens
-        finally:
-            del self._caught.tokens  # frees the batch
-
-    def _catch(self, module: torch.nn.Module, inputs: Any, output: Tensor) -> None:
-        if hasattr(self._caught, "tokens"):
-            self._caught.tokens.append(output)
-
-    def read(self, tokens: Tensor) -> Tensor:
-        """Embeddings of the patches ``[B, P * P, D]`` from captured tokens."""
-        attention = self._last.self_attn
-        values = attention.out_proj(attention.v_proj(tokens[:, 1:]))  # the class token comes first
-        return self._project(self._tower.post_layernorm(values))
-
-
 def _pooled(output: Any) -> Tensor:
     """The embedding: newer versions of transformers return an object that holds it, older ones the tensor."""
     return output if isinstance(output, Tensor) else output.pooler_output
-
-
-def _plain_attention(model: Any, vision_config: Any, image_size: int) -> None:
-    """Use eager attention in the image tower: on a CPU it is faster than the fused kernel for a few patches.
-
-    Models without CLIP's image tower or patch size are unchanged.
-    """
-    tower, patch = getattr(model, "vision_model", None), getattr(vision_config, "patch_size", None)
-    if tower is None or not isinstance(patch, int) or (image_size // patch) ** 2 > _FEW_PATCHES:
-        return
-    for module in tower.modules():
-        if hasattr(module, "config"):
-            module.config._attn_implementation = "eager"
 
 
 def _image_size(vision_config: Any) -> int:
