@@ -17,7 +17,7 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from torch import Tensor
 
-from lexsplat.geometry.boxes import Box, fit_box
+from lexsplat.geometry.boxes import Box, trimmed_box
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import back_project
@@ -95,7 +95,7 @@ def surface_points(views: Iterable[GroundTruthView], label: int, *, stride: int 
 
 def true_box(points: NDArray[np.float64], up: NDArray[np.float64]) -> Box:
     """The upright box of exact points, trimmed by a thousandth at each end (edges of masks)."""
-    return fit_box(points, up, trim=0.001)
+    return trimmed_box(points, up, 0.001)
 
 
 def selection_f1(mask: Tensor, ground_truth: Tensor, weights: Tensor) -> tuple[float, float, float]:

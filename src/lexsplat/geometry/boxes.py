@@ -6,6 +6,7 @@ and an upright box is stable for round objects, whose free box would have a rand
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -20,7 +21,11 @@ _DIRECTIONS = np.concatenate(
     [np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1), np.stack([-np.sin(_ANGLES), np.cos(_ANGLES)], 1)]
 )
 """First and second axis of the boxes of all angles ``[2 A, 2]``."""
-_SAMPLE = 2048  # points that determine the rotation of a box
+SAMPLE = 1024
+"""Points that determine the box of a thing."""
+_TURNED = 2048  # points that determine the rotation of a trimmed box
+_STRETCH, _DENSE = 0.03, 0.0075
+"""Part of the length of a thing, from 5 to 95 % of its points, and the share of them that it holds at an end."""
 
 
 class Box(NamedTuple):
@@ -91,37 +96,59 @@ def gravity_up(cameras: Iterable[Camera]) -> Up:
     return Up(mean_up / length, bool(length > 0.8))
 
 
-def fit_box(points: NDArray, up: NDArray, weights: NDArray | None = None, *, trim: float = 0.01) -> Box:
-    """The upright box with the smallest footprint around all but the outermost points.
+def fit_box(points: NDArray, up: NDArray, spreads: NDArray | None = None) -> Box:
+    """The upright box of a thing: it ends where its points are dense, and strays beyond do not count.
+
+    An end is the outermost point from which 3 % of the length hold .75 % of the points: about a quarter of what they
+    hold where the points are spread evenly. The axes have the smallest footprint, judged without the outermost 1 % and
+    without the outermost 5 %, both relative to the smallest one.
 
     Args:
-        points: ``[M, 3]``, M > 0, world units.
+        points: ``[M, 3]``, M > 0, world units, of equal weight; `representatives` picks those of many.
         up: World direction of one axis ``[3]``.
-        weights: Weight of each point ``[M]``; default is equal weights.
-        trim: Share of the weight that may lie beyond each end of each axis, in 0..0.5.
+        spreads: The axes of the Gaussians around the points as columns, times their standard deviations
+            ``[M, 3, 3]``: each counts at one standard deviation before and behind its center. None: at its center.
 
     Raises:
         ValueError: If there is no point.
     """
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-        raise ValueError(f"points must be [M, 3] with M > 0, got {list(points.shape)}")
-    shares = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
-    first, second, upwards = upright_frame(up)
-    step = max(1, len(points) // _SAMPLE)
-    flat, flat_shares = points[::step], shares[::step]
-    plane = np.stack([flat @ first, flat @ second], 1)
-    # Widths in all directions at once; the two sides of a box are a quarter of the turns apart.
-    low, high = _ends(plane @ _DIRECTIONS.T, flat_shares, trim)
-    widths = high - low
-    areas = widths[: len(_ANGLES)] * widths[len(_ANGLES) :]
-    smallest = areas.min()
-    # Round objects have no best angle; the first nearly optimal one keeps the box stable.
-    angle = next(a for a, area in zip(_ANGLES, areas) if area <= smallest * 1.02 + 1e-12)
-    turn = _turn(angle)
-    axes = np.stack([*(turn @ np.stack([first, second])), upwards])
-    low, high = _ends(points @ axes.T, shares, trim)
-    return Box(((low + high) / 2) @ axes, axes, (high - low) / 2)
+    points = _checked(points)
+    axes = _smallest_footprint(points, up, (0.01, 0.05))
+    along = points @ axes.T
+    if spreads is not None:
+        reach = np.linalg.norm(axes @ np.asarray(spreads, dtype=np.float64), axis=2)
+        along = np.concatenate([along - reach, along + reach])
+    return _box(*_dense_ends(along), axes)
+
+
+def representatives(weights: NDArray, count: int = SAMPLE) -> NDArray[np.intp]:
+    """Indices of points that stand for all in `fit_box`: each is there as often as it weighs.
+
+    Args:
+        weights: Weight of each point ``[M]``, not negative, M > 0.
+        count: Most indices; at most two for each point.
+    """
+    reached = np.cumsum(np.asarray(weights, dtype=np.float64))
+    count = min(count, 2 * len(reached))
+    steps = (np.arange(count) + 0.5) / count * reached[-1]
+    return np.searchsorted(reached, steps).clip(0, len(reached) - 1)
+
+
+def trimmed_box(points: NDArray, up: NDArray, trim: float) -> Box:
+    """The upright box with the smallest footprint around all but a share of the points.
+
+    Args:
+        points: ``[M, 3]``, M > 0, world units.
+        up: World direction of one axis ``[3]``.
+        trim: Share of the points that may lie beyond each end of each axis, in 0..0.5.
+
+    Raises:
+        ValueError: If there is no point.
+    """
+    points = _checked(points)
+    axes = _smallest_footprint(points[:: max(1, len(points) // _TURNED)], up, (trim,))
+    low, high = _trimmed_ends(points @ axes.T, (trim,))
+    return _box(low[0], high[0], axes)
 
 
 def upright_frame(up: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -138,21 +165,47 @@ def _turn(angle: float) -> NDArray[np.float64]:
     return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
 
 
-def _ends(values: NDArray, weights: NDArray, trim: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Weighted quantiles ``trim`` and ``1 - trim`` of every column ``[M, C]``."""
-    count, columns = values.shape
-    rows = np.ascontiguousarray(values.T)
-    limit, kept = trim * float(weights.sum()), min(count, 16 + int(6 * trim * count))
-    while True:  # only the tails are sorted; light tails have more points
-        parted = np.argpartition(rows, sorted({kept - 1, count - kept}), axis=1)  # both tails of a row
-        tails = np.concatenate([parted[:, :kept], parted[:, count - kept :]])
-        found = np.take_along_axis(np.concatenate([rows, -rows]), tails, 1)
-        order = np.argsort(found, axis=1)
-        beyond = np.cumsum(weights[np.take_along_axis(tails, order, 1)], axis=1)
-        if kept == count or beyond[:, -1].min() > limit:
-            break
-        kept = min(count, 4 * kept)
-    places = np.concatenate([(beyond[:columns] < limit).sum(1), (beyond[columns:] <= limit).sum(1)])
-    every = np.arange(len(found))
-    ends = found[every, order[every, places.clip(0, kept - 1)]]
-    return ends[:columns], -ends[columns:]
+def _checked(points: NDArray) -> NDArray[np.float64]:
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise ValueError(f"points must be [M, 3] with M > 0, got {list(points.shape)}")
+    return points
+
+
+def _box(low: NDArray, high: NDArray, axes: NDArray) -> Box:
+    return Box(((low + high) / 2) @ axes, axes, (high - low) / 2)
+
+
+def _smallest_footprint(points: NDArray, up: NDArray, trims: tuple[float, ...]) -> NDArray[np.float64]:
+    """Axes ``[3, 3]`` whose footprints, relative to the smallest one at each trim, have the smallest sum."""
+    first, second, upwards = upright_frame(up)
+    plane = np.stack([points @ first, points @ second], 1)
+    # Widths in all directions at once; the two sides of a box are a quarter of the turns apart.
+    low, high = _trimmed_ends(plane @ _DIRECTIONS.T, trims)
+    widths = high - low
+    areas = widths[:, : len(_ANGLES)] * widths[:, len(_ANGLES) :] + 1e-12
+    relative = (areas / areas.min(1, keepdims=True)).mean(0)
+    # Round objects have no best angle; the first nearly optimal one keeps the box stable.
+    turn = _turn(next(a for a, area in zip(_ANGLES, relative) if area <= relative.min() * 1.02))
+    return np.stack([*(turn @ np.stack([first, second])), upwards])
+
+
+def _trimmed_ends(
+    values: NDArray, trims: tuple[float, ...]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The lowest and highest of every column of ``[M, C]`` but for a share at each end, for each share ``[T, C]``."""
+    count = len(values)
+    low = [max(math.ceil(trim * count) - 1, 0) for trim in trims]
+    high = [count - 1 - math.floor(trim * count) for trim in trims]
+    parted = np.partition(np.ascontiguousarray(values.T), sorted({*low, *high}), axis=1)
+    return parted[:, low].T, parted[:, high].T
+
+
+def _dense_ends(values: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The outermost of every column of ``[M, C]`` from which `_STRETCH` of the length hold `_DENSE` of all."""
+    rows = np.sort(values, axis=0)
+    count, more = len(rows), math.ceil(_DENSE * len(rows)) - 1
+    length = rows[int(0.95 * count)] - rows[int(0.05 * count)]
+    dense = rows[more:] - rows[: count - more] <= _STRETCH * length
+    every = np.arange(rows.shape[1])
+    return rows[dense.argmax(0), every], rows[count - 1 - dense[::-1].argmax(0), every]

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from lexsplat.geometry.boxes import Box, Up, fit_box
+from lexsplat.geometry.boxes import Box, Up, fit_box, representatives
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.rotations import matrices_from_quaternions
 from lexsplat.geometry.world import World
 from lexsplat.queries.clusters import LINK, clusters, spacing
 from lexsplat.rendering import render
@@ -146,8 +147,11 @@ class Selection:
         """
         if not self:
             raise QueryError(self.phrase or "selection", expected="something selected", found="nothing")
-        points, weights = self._points()
-        return fit_box(points, self.up.direction, weights)
+        opacities = self.gaussians.opacity_logits.detach()[self.indices].sigmoid().cpu().numpy()
+        chosen = torch.from_numpy(representatives(opacities)).to(self.indices.device)
+        thin = self.gaussians.select(self.indices[chosen]).detach()
+        spreads = matrices_from_quaternions(thin.quats) * thin.scales[:, None]
+        return fit_box(thin.means.cpu().numpy(), self.up.direction, spreads.cpu().numpy())
 
     @property
     def center(self) -> NDArray[np.float64]:

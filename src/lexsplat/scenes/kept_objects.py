@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("lexsplat")
 
 FILE = "objects.safetensors"
-_VERSION = 1
+_VERSION = 2
 """Raised when the content is computed in another way."""
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 
-from lexsplat.geometry.boxes import Box, Up, fit_box
+from lexsplat.geometry.boxes import Box, Up, trimmed_box
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.pipeline.viewpoints.upward import LOW, UpwardDirections, find_upward
 from lexsplat.rendering.compositing import NEAR
@@ -123,7 +123,7 @@ def find_surroundings(
 
     def facing(direction: Up) -> Surroundings:
         ground, top = np.quantile(core @ direction.direction, [LOW, 1 - LOW])
-        box = fit_box(core, direction.direction, trim=LOW)
+        box = trimmed_box(core, direction.direction, LOW)
         return Surroundings(tree, direction, float(ground), float(top - ground), box, whole, targets)
 
     upward = find_upward(core, lambda direction: look(facing(Up(direction, True))))

@@ -21,7 +21,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from lexsplat.geometry.boxes import fit_box
+from lexsplat.geometry.boxes import fit_box, representatives
 from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
 from lexsplat.geometry.world import World
 from lexsplat.language.segment_codes import SegmentCodes, segment_codes
@@ -268,8 +268,7 @@ def _instance(
     # A point stands for the Gaussians of its segment that are not kept.
     weights = contents.weights.numpy()[rows].astype(np.float64) * contents.counts.numpy()[of] / kept
     up = np.array(contents.facts["world"]["up"]["direction"], np.float64)
-    thin = slice(None, None, -(-len(points) // _BOXED))
-    box, opacities = fit_box(points[thin], up, weights[thin]), contents.opacities.numpy()[part]
+    box, opacities = fit_box(points[representatives(weights, _BOXED)], up), contents.opacities.numpy()[part]
     view, frame = _best_view(contents, part)
     data = {
         "name": name,
