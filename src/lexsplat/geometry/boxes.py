@@ -26,6 +26,8 @@ SAMPLE = 1024
 _TURNED = 2048  # points that determine the rotation of a trimmed box
 _STRETCH, _DENSE = 0.03, 0.0075
 """Part of the length of a thing, from 5 to 95 % of its points, and the share of them that it holds at an end."""
+_FEW = 0.01
+"""Share of the points that may lie far beyond an end."""
 
 
 class Box(NamedTuple):
@@ -99,9 +101,10 @@ def gravity_up(cameras: Iterable[Camera]) -> Up:
 def fit_box(points: NDArray, up: NDArray, spreads: NDArray | None = None) -> Box:
     """The upright box of a thing: it ends where its points are dense, and strays beyond do not count.
 
-    An end is the outermost point from which 3 % of the length hold .75 % of the points: about a quarter of what they
-    hold where the points are spread evenly. The axes have the smallest footprint, judged without the outermost 1 % and
-    without the outermost 5 %, both relative to the smallest one.
+    An end is dense where the next 3 % of the length inwards hold .75 % of the points: about a quarter of what they hold
+    where the points are spread evenly. Strays are few or near: all but 1 % of the points lie at most 3 % of the longest
+    side beyond an end. What is more and farther is a sparse part, such as the pot under a plant. The axes have the
+    smallest footprint, judged without the outermost 1 % and without the outermost 5 %, each relative to the smallest.
 
     Args:
         points: ``[M, 3]``, M > 0, world units, of equal weight; `representatives` picks those of many.
@@ -118,7 +121,9 @@ def fit_box(points: NDArray, up: NDArray, spreads: NDArray | None = None) -> Box
     if spreads is not None:
         reach = np.linalg.norm(axes @ np.asarray(spreads, dtype=np.float64), axis=2)
         along = np.concatenate([along - reach, along + reach])
-    return _box(*_dense_ends(along), axes)
+    (low, high), ([fewest_low], [fewest_high]) = _dense_ends(along), _trimmed_ends(along, (_FEW,))
+    near = _STRETCH * (fewest_high - fewest_low).max()
+    return _box(np.minimum(low, fewest_low + near), np.maximum(high, fewest_high - near), axes)
 
 
 def representatives(weights: NDArray, count: int = SAMPLE) -> NDArray[np.intp]:
