@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.tilted_cameras import UP, cameras
 
-from lexsplat.geometry.boxes import Box, fit_box, gravity_up
+from lexsplat.geometry.boxes import Box, fit_box, gravity_up, representatives, trimmed_box
 from lexsplat.geometry.cameras import look_at
 
 
@@ -15,30 +15,161 @@ def turned(angle: float, center=(0.0, 0.0, 0.0), halves=(1.0, 0.5, 0.25)) -> Box
     return Box(np.array(center, float), axes, np.array(halves, float))
 
 
+def uniform(rng, count, low, high):
+    return rng.uniform(low, high, (count, 3))
+
+
+def on_box(rng, count):
+    """The surface of a box of 2 by 1 by 0.8."""
+    halves, side = np.array([1.0, 0.5, 0.4]), rng.choice(3, count, p=np.array([0.4, 0.8, 1.0]) / 2.2)
+    points = uniform(rng, count, -halves, halves)
+    points[np.arange(count), side] = rng.choice([-1, 1], count) * halves[side]
+    return points
+
+
+def on_sphere(rng, count):
+    points = rng.normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True) * 0.5
+
+
+def on_ring(rng, count):
+    """A ring that lies: 1 wide, 0.1 high."""
+    around, across = rng.uniform(0, 2 * np.pi, (2, count))
+    out = 0.45 + 0.05 * np.cos(across)
+    return np.stack([out * np.cos(around), out * np.sin(around), 0.05 * np.sin(across)], 1)
+
+
+def mug_with_handle(rng, count):
+    """A cylinder of radius 0.4 with a handle that reaches 0.25 beyond it, a tenth of the points."""
+    around = rng.uniform(0, 2 * np.pi, count)
+    body = np.stack([0.4 * np.cos(around), 0.4 * np.sin(around), rng.uniform(-0.5, 0.5, count)], 1)
+    bow = rng.uniform(-np.pi / 2, np.pi / 2, count // 10)
+    thick = rng.normal(0, 0.02, len(bow))
+    handle = np.stack([0.4 + 0.25 * np.cos(bow), thick, 0.3 * np.sin(bow)], 1)
+    return np.concatenate([body[: count - len(handle)], handle])
+
+
+def on_plate(rng, count):
+    """A cloth of 2 by 1.4, 0.02 thick."""
+    return uniform(rng, count, [-1, -0.7, -0.01], [1, 0.7, 0.01])
+
+
+SHAPES = {"box": on_box, "sphere": on_sphere, "ring": on_ring, "mug": mug_with_handle, "plate": on_plate}
+
+
+def rotated(points, angle):
+    return points @ turned(angle).axes
+
+
 @given(st.floats(0, 1.5), st.integers(0, 5))
 @settings(max_examples=20)
 def test_a_box_around_a_rotated_block_has_the_size_and_center_of_the_block(angle, seed):
     rng = np.random.default_rng(seed)
     block = turned(angle, center=(1.0, -2.0, 3.0))
     points = block.center + (rng.uniform(-1, 1, (4000, 3)) * block.half_sizes) @ block.axes
-    found = fit_box(points, UP, trim=0.0)
-    assert np.sort(found.half_sizes[:2]) == pytest.approx([0.5, 1.0], rel=0.06)
-    assert found.half_sizes[2] == pytest.approx(0.25, rel=0.02)
-    assert found.center == pytest.approx(block.center, abs=0.05)
-    assert np.linalg.det(found.axes) == pytest.approx(1.0)
+    for found in (fit_box(points, UP), trimmed_box(points, UP, 0.0)):
+        assert np.sort(found.half_sizes[:2]) == pytest.approx([0.5, 1.0], rel=0.08)
+        assert found.half_sizes[2] == pytest.approx(0.25, rel=0.02)
+        assert found.center == pytest.approx(block.center, abs=0.05)
+        assert np.linalg.det(found.axes) == pytest.approx(1.0)
 
 
-def test_a_few_far_points_do_not_move_a_box():
+@pytest.mark.parametrize("strays", [0.0, 0.002, 0.005, 0.01])
+@pytest.mark.parametrize("shape", SHAPES)
+@given(angle=st.floats(0, 1.5), seed=st.integers(0, 1000))
+@settings(max_examples=8, deadline=None)
+def test_a_box_has_the_size_of_the_shape_whatever_few_strays_lie_around_it(shape, strays, angle, seed):
+    rng = np.random.default_rng(seed)
+    points = SHAPES[shape](rng, 1000)
+    far = uniform(rng, int(strays * 1000), -3.0, 3.0)
+    found = fit_box(rotated(np.concatenate([points, far]), angle), UP)
+    exact = trimmed_box(rotated(points, angle), UP, 0.0)
+    # Angles come in steps of two degrees, which makes long things wider.
+    assert np.sort(found.half_sizes[:2]) == pytest.approx(np.sort(exact.half_sizes[:2]), rel=0.12)
+    assert found.half_sizes[2] == pytest.approx(exact.half_sizes[2], rel=0.1)
+    assert found.center == pytest.approx(exact.center, abs=0.1)
+
+
+def test_a_thin_thing_stays_thin_though_strays_lie_near_it():
     rng = np.random.default_rng(0)
-    points = rng.uniform(-1, 1, (1000, 3))
-    stray = np.vstack([points, [[50.0, 0, 0], [0, 40.0, 0]]])
-    assert fit_box(stray, UP).half_sizes == pytest.approx(fit_box(points, UP).half_sizes, rel=0.05)
+    near = uniform(rng, 60, [-1, -0.7, -0.05], [1, 0.7, 0.05])
+    points = np.concatenate([on_plate(rng, 940), near])
+    assert 2 * fit_box(points, UP).half_sizes[2] == pytest.approx(0.02, rel=0.15)
+    assert 2 * trimmed_box(points, UP, 0.01).half_sizes[2] > 0.04
+
+
+@pytest.mark.parametrize("share", [0.03, 0.06])
+def test_a_sparse_part_belongs_to_the_box(share):
+    rng = np.random.default_rng(0)
+    leaves, pot = on_sphere(rng, 1000), uniform(rng, int(share * 1000), [-0.2, -0.2, -0.9], [0.2, 0.2, -0.5])
+    found = fit_box(np.concatenate([leaves, pot]), UP)
+    assert found.center[2] - found.half_sizes[2] < -0.7
+    assert found.center[2] + found.half_sizes[2] == pytest.approx(0.5, abs=0.02)
+
+
+@given(st.integers(0, 1000), st.integers(1, 300))
+@settings(max_examples=40, deadline=None)
+def test_an_end_is_where_a_stretch_is_dense_unless_many_lie_far_beyond(seed, count):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(count, 3)) * rng.uniform(0.1, 2, 3) * rng.choice([1, 1, 1, 4], (count, 1))
+    found = fit_box(points, UP)
+    along = np.sort(points @ found.axes.T, axis=0)
+    few = count - 1 - int(0.01 * count) - max(int(np.ceil(0.01 * count)) - 1, 0)  # steps between the trimmed ends
+    first = max(int(np.ceil(0.01 * count)) - 1, 0)
+    near = 0.03 * (along[first + few] - along[first]).max()
+    for column, middle, half in zip(along.T, found.axes @ found.center, found.half_sizes):
+        stretch = 0.03 * (column[int(0.95 * count)] - column[int(0.05 * count)])
+        low = next(v for v in column if ((column >= v) & (column - v <= stretch)).sum() >= 0.0075 * count)
+        high = next(v for v in column[::-1] if ((column <= v) & (v - column <= stretch)).sum() >= 0.0075 * count)
+        low, high = min(low, column[first] + near), max(high, column[first + few] - near)
+        assert [middle - half, middle + half] == pytest.approx([low, high], abs=1e-9)
+
+
+def test_gaussians_count_one_standard_deviation_beyond_their_centers():
+    found = fit_box(np.array([[1.0, 2.0, 3.0]]), UP, np.diag([0.1, 0.2, 0.3])[None])
+    assert found.center == pytest.approx([1, 2, 3])
+    assert np.abs(found.axes.T @ found.half_sizes) == pytest.approx([0.1, 0.2, 0.3])
+    rng = np.random.default_rng(0)
+    points, spread = uniform(rng, 1000, -1.0, 1.0), np.full((1000, 3, 3), np.eye(3) * 0.1)
+    gained = fit_box(points, UP, spread).half_sizes - fit_box(points, UP).half_sizes
+    assert gained == pytest.approx([0.1] * 3, abs=0.02)
+
+
+@given(st.lists(st.floats(0, 5), min_size=1, max_size=60), st.integers(1, 200))
+def test_representatives_are_as_many_as_each_point_weighs(weights, most):
+    weights = np.array(weights)
+    chosen = representatives(weights, most)
+    assert len(chosen) == min(most, 2 * len(weights))
+    if weights.sum() > 1e-3:
+        expected = weights / weights.sum() * len(chosen)
+        assert np.abs(np.bincount(chosen, minlength=len(weights)) - expected).max() <= 1 + 1e-6
 
 
 def test_points_of_zero_weight_are_ignored():
     points = np.vstack([np.random.default_rng(0).uniform(-1, 1, (500, 3)), np.full((200, 3), 9.0)])
-    weights = np.r_[np.ones(500), np.zeros(200)]
-    assert fit_box(points, UP, weights).half_sizes.max() < 1.5
+    chosen = representatives(np.r_[np.ones(500), np.zeros(200)])
+    assert chosen.max() < 500
+    assert fit_box(points[chosen], UP).half_sizes.max() < 1.5
+
+
+@pytest.mark.parametrize("trim", [0.0, 0.01, 0.1, 0.5])
+@pytest.mark.parametrize("count", [1, 7, 300, 5000])
+def test_a_trimmed_box_ends_at_the_quantiles_along_its_axes(count, trim):
+    points = np.random.default_rng(count).normal(size=(count, 3))
+    found = trimmed_box(points, UP, trim)
+    along = np.sort(points @ found.axes.T, axis=0)
+    reached = np.arange(1, count + 1) / count
+    low, high = (along[np.argmax(reached >= limit)] for limit in (trim, 1 - trim))
+    middle = found.axes @ found.center
+    step = np.diff(along, axis=0).max(initial=0) if trim == 0.5 else 1e-9  # between two points where the count is even
+    assert np.abs(middle - found.half_sizes - low).max() <= step
+    assert np.abs(middle + found.half_sizes - high).max() <= step
+
+
+def test_points_in_a_line_or_a_plane_have_a_flat_box_along_them():
+    line = np.linspace(0, 1, 50)[:, None] * [np.cos(0.5236), np.sin(0.5236), 0]
+    for found in (fit_box(line, UP), trimmed_box(line, UP, 0.0)):
+        assert np.sort(found.half_sizes) == pytest.approx([0, 0, 0.5], abs=1e-5)
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (1, 2, -0.5)])

@@ -1,9 +1,8 @@
-"""Clusters against plain loops over all pairs, and boxes against sorted quantiles."""
+"""Clusters against plain loops over all pairs."""
 
 import numpy as np
 import pytest
 
-from lexsplat.geometry.boxes import _ends
 from lexsplat.queries.clusters import LINK, clusters, spacing
 
 
@@ -38,17 +37,3 @@ def test_spacing_is_the_median_distance_to_the_sixth_neighbor():
     line = np.stack([np.arange(100.0), np.zeros(100), np.zeros(100)], 1)
     assert spacing(line) == 3.0
     assert spacing(line[:2]) == 1.0
-
-
-@pytest.mark.parametrize("trim", [0.01, 0.1, 0.5])
-@pytest.mark.parametrize("count", [1, 7, 300, 5000])
-def test_the_ends_of_a_box_are_weighted_quantiles(count, trim):
-    random = np.random.default_rng(count)
-    values = random.normal(size=(count, 3))
-    weights = random.random(count) * np.exp(-3 * np.abs(values[:, 0]))  # light tails
-    low, high = _ends(values, weights, trim)
-    for column in range(3):
-        order = np.argsort(values[:, column])
-        reached = np.cumsum(weights[order]) / weights.sum()
-        expected = [values[order[np.argmax(reached >= limit)], column] for limit in (trim, 1 - trim)]
-        assert [low[column], high[column]] == pytest.approx(expected)

@@ -56,6 +56,7 @@ def select() -> Callable[..., Selection]:
     gaussians = gaussians_from_points(
         np.concatenate(points), np.full((len(labels), 3), 0.5), sh_degree=0, opacity=0.8
     )
+    gaussians.log_scales -= 1.5  # thin, as training makes those of surfaces
     labels = np.array(labels)
     cameras = {"front": FRONT, "back": BACK, "side": look_at([5.0, 0, 1.5], [0, 0, 0], UP, 64, 48, 0.8)}
 
