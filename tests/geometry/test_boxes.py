@@ -114,13 +114,17 @@ def test_an_end_is_where_a_stretch_is_dense_unless_many_lie_far_beyond(seed, cou
     points = rng.normal(size=(count, 3)) * rng.uniform(0.1, 2, 3) * rng.choice([1, 1, 1, 4], (count, 1))
     found = fit_box(points, UP)
     along = np.sort(points @ found.axes.T, axis=0)
-    few = count - 1 - int(0.01 * count) - max(int(np.ceil(0.01 * count)) - 1, 0)  # steps between the trimmed ends
+    few = (
+        count - 1 - int(0.01 * count) - max(int(np.ceil(0.01 * count)) - 1, 0)
+    )  # steps between the trimmed ends
     first = max(int(np.ceil(0.01 * count)) - 1, 0)
     near = 0.03 * (along[first + few] - along[first]).max()
     for column, middle, half in zip(along.T, found.axes @ found.center, found.half_sizes):
         stretch = 0.03 * (column[int(0.95 * count)] - column[int(0.05 * count)])
         low = next(v for v in column if ((column >= v) & (column - v <= stretch)).sum() >= 0.0075 * count)
-        high = next(v for v in column[::-1] if ((column <= v) & (v - column <= stretch)).sum() >= 0.0075 * count)
+        high = next(
+            v for v in column[::-1] if ((column <= v) & (v - column <= stretch)).sum() >= 0.0075 * count
+        )
         low, high = min(low, column[first] + near), max(high, column[first + few] - near)
         assert [middle - half, middle + half] == pytest.approx([low, high], abs=1e-9)
 
@@ -161,7 +165,8 @@ def test_a_trimmed_box_ends_at_the_quantiles_along_its_axes(count, trim):
     reached = np.arange(1, count + 1) / count
     low, high = (along[np.argmax(reached >= limit)] for limit in (trim, 1 - trim))
     middle = found.axes @ found.center
-    step = np.diff(along, axis=0).max(initial=0) if trim == 0.5 else 1e-9  # between two points where the count is even
+    # Between two points where the count is even.
+    step = np.diff(along, axis=0).max(initial=0) if trim == 0.5 else 1e-9
     assert np.abs(middle - found.half_sizes - low).max() <= step
     assert np.abs(middle + found.half_sizes - high).max() <= step
 

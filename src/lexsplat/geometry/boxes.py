@@ -101,10 +101,11 @@ def gravity_up(cameras: Iterable[Camera]) -> Up:
 def fit_box(points: NDArray, up: NDArray, spreads: NDArray | None = None) -> Box:
     """The upright box of a thing: it ends where its points are dense, and strays beyond do not count.
 
-    An end is dense where the next 3 % of the length inwards hold .75 % of the points: about a quarter of what they hold
-    where the points are spread evenly. Strays are few or near: all but 1 % of the points lie at most 3 % of the longest
-    side beyond an end. What is more and farther is a sparse part, such as the pot under a plant. The axes have the
-    smallest footprint, judged without the outermost 1 % and without the outermost 5 %, each relative to the smallest.
+    An end is dense where the next 3 % of the length inwards hold .75 % of the points: about a quarter of what they
+    hold where the points are spread evenly. Strays are few or near: all but 1 % of the points lie at most 3 % of the
+    longest side beyond an end. What is more and farther is a sparse part, such as the pot under a plant. The axes
+    have the smallest footprint, judged without the outermost 1 % and the outermost 5 %, each relative to the
+    smallest.
 
     Args:
         points: ``[M, 3]``, M > 0, world units, of equal weight; `representatives` picks those of many.
