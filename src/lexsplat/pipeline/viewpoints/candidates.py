@@ -55,36 +55,32 @@ def around(surroundings: Surroundings, size: tuple[int, int]) -> list[tuple[Came
     A camera is above the ground, on the inner side of a wall it looks at, and not close to anything.
     """
     found = []
-    least = _CLOSEST * surroundings.whole.radius / math.sin(FOV_Y / 2)
-    for target in (surroundings.whole, *surroundings.targets):
+    up, whole = surroundings.up.direction, surroundings.whole
+    least = _CLOSEST * whole.radius / math.sin(FOV_Y / 2)
+    for target in (whole, *surroundings.targets):
         reach = max(target.radius / math.sin(FOV_Y / 2), least)
-        for position in _circle_positions(target, reach, surroundings):
+        positions = _circle_positions(target, reach, up, 2 * _AZIMUTHS if target is whole else _AZIMUTHS)
+        free = surroundings.tree.query(positions)[0]
+        for position, room in zip(positions, free):
             away = position - target.center
             distance = float(np.linalg.norm(away))
             behind = target.normal is not None and away @ target.normal < 0.1 * distance
-            under = position @ surroundings.up.direction < surroundings.ground + 0.05 * surroundings.height
-            close = surroundings.tree.query(position)[0] < _CLEARANCE * distance
-            if not (behind or under or close):
-                found.append(
-                    (look_at(position, target.center, surroundings.up.direction, *size, FOV_Y), target)
-                )
+            under = position @ up < surroundings.ground + 0.05 * surroundings.height
+            if not (behind or under or room < _CLEARANCE * distance):
+                found.append((look_at(position, target.center, up, *size, FOV_Y), target))
     return found
 
 
-def above(surroundings: Surroundings, size: tuple[int, int]) -> list[Camera]:
+def above(whole: Target, up: Points, size: tuple[int, int]) -> list[Camera]:
     """Cameras on a circle above the whole scene, wherever that is."""
-    whole = surroundings.whole
     reach = whole.radius / math.sin(FOV_Y / 2)
-    positions = _circle_positions(whole, reach, surroundings)[2 * _AZIMUTHS : 4 * _AZIMUTHS : 2]
-    return [
-        look_at(position, whole.center, surroundings.up.direction, *size, FOV_Y) for position in positions
-    ]
+    positions = _circle_positions(whole, reach, up, 2 * _AZIMUTHS)[2 * _AZIMUTHS : 4 * _AZIMUTHS : 2]
+    return [look_at(position, whole.center, up, *size, FOV_Y) for position in positions]
 
 
-def _circle_positions(target: Target, reach: float, surroundings: Surroundings) -> list[Points]:
-    first, second, up = upright_frame(surroundings.up.direction)
+def _circle_positions(target: Target, reach: float, up: Points, azimuths: int) -> list[Points]:
+    first, second, up = upright_frame(up)
     positions = []
-    azimuths = 2 * _AZIMUTHS if target is surroundings.whole else _AZIMUTHS
     for ring, (distance, elevation) in enumerate((d, e) for d in _DISTANCES for e in _ELEVATIONS):
         for number in range(azimuths):
             angle = 2 * math.pi * (number + 0.5 * (ring % 2)) / azimuths

@@ -128,7 +128,7 @@ def _before_surfaces(gaussians: Gaussians, up: NDArray[np.float64] | None, seed:
     engulfing = own[suspects] < _ENGULFING
     before, on = (np.zeros(len(suspects), np.int64) for _ in range(2))
     for camera in _cameras(_select(gaussians, solid), up, seed, generator):
-        for part in range(_PARTS):
+        for part in np.unique(parts):
             members = np.flatnonzero(parts == part)
             gaps, depths = _gaps(rest[part], camera, points[members])
             margins = np.clip(np.where(engulfing, 0, radii)[members, None] / depths, *_SAME_DEPTH)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.pipeline.viewpoints.candidates import above
-from lexsplat.pipeline.viewpoints.surroundings import Surroundings
+from lexsplat.pipeline.viewpoints.surroundings import Target
 from lexsplat.rendering import prepare, render
 
 SMALL = (96, 72)
@@ -41,11 +41,11 @@ def draw_depth(gaussians: Gaussians, camera: Camera) -> tuple[Image, Image, Imag
     return depth, square, alpha
 
 
-def look_from_above(gaussians: Gaussians) -> Callable[[Surroundings], float]:
-    """How much Gaussians look like surfaces from above a ground, in 0..1, as a function of the surroundings."""
+def look_from_above(gaussians: Gaussians) -> Callable[[Target, NDArray[np.float64]], float]:
+    """How much Gaussians look like surfaces from above, in 0..1, as a function of the whole and the up direction."""
 
-    def measure(surroundings: Surroundings) -> float:
-        shares = [look(gaussians, camera)[1] for camera in above(surroundings, SMALL)]
+    def measure(whole: Target, up: NDArray[np.float64]) -> float:
+        shares = [look(gaussians, camera)[1] for camera in above(whole, up, SMALL)]
         return float(np.mean(sorted(shares)[len(shares) // 2 :]))  # photos are often taken from one side only
 
     return measure

@@ -8,7 +8,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-_NEIGHBORS = 12
+from lexsplat.pipeline.viewpoints.pieces import Pieces
+
 _WITHIN = 0.04
 """Things are this far within the convex hull of a scene, relative to its diagonal."""
 _MARGIN = 0.25
@@ -30,7 +31,7 @@ Points = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-def standing_shares(points: Points, directions: Points) -> Points:
+def standing_shares(pieces: Pieces, directions: Points) -> Points:
     """Share of the things of a scene that stand on its lowest side, less that at its highest ``[D]``, in 0..1.
 
     Things stand on the floor of a room, and few touch the ceiling. Only some touch a wall, or what is between two
@@ -39,36 +40,37 @@ def standing_shares(points: Points, directions: Points) -> Points:
     nothing.
 
     Args:
-        points: Solid points ``[M, 3]`` of the middle of the scene.
+        pieces: Surfaces of the middle of the scene.
         directions: Up directions ``[D, 3]``, of unit length.
     """
-    link = _LINK * float(np.median(cKDTree(points).query(points, k=_NEIGHBORS)[0][:, -1]))
+    points, link = pieces.points, _LINK * float(np.median(pieces.reach))
     low, high = np.quantile(points, [0.02, 0.98], axis=0)
     deep = max(_WITHIN * float(np.linalg.norm(high - low)), link / 2)
     try:
         hull = ConvexHull(points).equations
     except (QhullError, ValueError):  # all in one plane
         return np.zeros(len(directions))
-    depths = -(points @ hull[:, :3].T + hull[:, 3])
-    inner = depths.min(1) > deep
+    near = -(points @ hull[:, :3].T + hull[:, 3]) <= deep
+    inner = ~near.any(1)
     if inner.sum() < _FEWEST_OF_A_THING:
         return np.zeros(len(directions))
-    things = _linked(points, inner, link)
+    pairs = cKDTree(points).query_pairs(link, output_type="ndarray")
+    things = _linked(pairs, inner)
     sizes = np.bincount(things[inner])
-    ends = np.concatenate([directions, -directions])
+    ends, which = np.unique(np.concatenate([directions, -directions]) + 0.0, axis=0, return_inverse=True)
+    others = (ends @ hull[:, :3].T > -_FACING).astype(np.float32)
+    beside = near.astype(np.float32) @ others.T > 0  # of another side, for each end [M, E]
     touching, gaps = np.zeros((len(ends), len(sizes)), bool), np.full((len(ends), len(sizes)), np.inf)
-    for end, touches, gap in zip(ends, touching, gaps):
+    for end, other, touches, gap in zip(ends, beside.T, touching, gaps):
         heights = points @ end - np.quantile(points @ end, _OUTSIDE)
-        others = hull[:, :3] @ end > -_FACING
-        until = (heights > _MARGIN * deep) & (depths[:, others].min(1, initial=np.inf) > deep)
-        members = inner | until
-        wholes = _linked(points, members, link)
+        members = inner | ((heights > _MARGIN * deep) & ~other)
+        wholes = _linked(pairs, members)
         lowest = np.full(len(points), np.inf)
         np.minimum.at(lowest, wholes[members], heights[members])
         np.minimum.at(gap, things[inner], heights[inner])
         touches[things[inner & (lowest[wholes] < _MARGIN * deep + link / 4)]] = True
     nearest = (gaps < deep + link) & (gaps < _NEAREST * gaps.min(0))
-    lows, highs = (touching | (nearest & ~touching.any(0))).reshape(2, len(directions), -1)
+    lows, highs = (touching | (nearest & ~touching.any(0)))[which.ravel()].reshape(2, len(directions), -1)
     alone = ~(lows & highs).any(0)
     counted = np.where(sizes >= _FEWEST_OF_A_THING, sizes, 0)
     telling = max(float((counted * alone).sum()), _TELLING * float(counted.sum()), 1.0)
@@ -76,11 +78,11 @@ def standing_shares(points: Points, directions: Points) -> Points:
     return np.asarray(np.maximum(shares, 0))
 
 
-def _linked(points: Points, members: Mask, link: float) -> NDArray[np.int64]:
-    """Number of the thing that each member is part of ``[M]``; that of all others means nothing."""
-    pairs = cKDTree(points[members]).query_pairs(link, output_type="ndarray")
-    count = int(members.sum())
-    graph = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
-    labels = np.zeros(len(points), np.int64)
+def _linked(pairs: NDArray[np.int64], members: Mask) -> NDArray[np.int64]:
+    """Number of the thing that each member is part of ``[M]``, by pairs of near points ``[P, 2]``; 0 for others."""
+    count, numbers = int(members.sum()), np.cumsum(members) - 1
+    linked = numbers[pairs[members[pairs].all(1)]]
+    graph = coo_array((np.ones(len(linked), bool), linked.T), shape=(count, count))
+    labels = np.zeros(len(members), np.int64)
     labels[members] = connected_components(graph, directed=False)[1]
     return labels

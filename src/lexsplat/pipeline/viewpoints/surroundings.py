@@ -84,7 +84,7 @@ class Surroundings:
 def find_surroundings(
     gaussians: Gaussians,
     up: Points | None,
-    look: Callable[[Surroundings], float],
+    look: Callable[[Target, Points], float],
     subject: Path,
     seed: int = 0,
     *,
@@ -95,7 +95,8 @@ def find_surroundings(
     Args:
         gaussians: The scene.
         up: The up direction of the user; None estimates it.
-        look: How much the splat looks like surfaces from above its ground, in 0..1; helps to estimate up.
+        look: How much the splat looks like surfaces from above its ground, in 0..1, as a function of the whole and
+            the up direction; helps to estimate it.
         subject: The file, for errors.
         seed: Seed of the sample and of the targets.
         warn: Warn of an up direction that is a guess or seems wrong, and of a flat scene.
@@ -126,11 +127,14 @@ def find_surroundings(
         box = trimmed_box(core, direction.direction, LOW)
         return Surroundings(tree, direction, float(ground), float(top - ground), box, whole, targets)
 
-    upward = find_upward(core, lambda direction: look(facing(Up(direction, True))))
+    given = None if up is None else facing(Up(up / np.linalg.norm(up), True))
+    if given is not None and not warn:
+        return given
+    upward = find_upward(core, lambda direction: look(whole, direction))
     if warn:
         _warn(upward, up, points, subject)
-    if up is not None:
-        return facing(Up(up / np.linalg.norm(up), True))
+    if given is not None:
+        return given
     estimated = facing(Up(upward.directions[0], upward.reliable))
     if upward.reliable:
         return estimated

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from lexsplat.geometry.boxes import upright_frame
+from lexsplat.pipeline.viewpoints.pieces import Pieces
 from lexsplat.pipeline.viewpoints.standing import standing_shares
 
-_NEIGHBORS = 12
 _CONVENTIONS = ((0, 0, 1), (0, 1, 0), (0, -1, 0))
 """Up directions of files that follow a convention: z up, y up (glTF), y down (COLMAP)."""
 _TILTED = math.cos(math.radians(15))
@@ -77,10 +76,11 @@ def find_upward(points: Points, look: Callable[[Points], float]) -> UpwardDirect
         points: Solid points ``[M, 3]`` of the middle of the scene.
         look: How much the splat looks like surfaces from above, in 0..1, if a direction is up.
     """
-    candidates = up_candidates(points)
+    pieces = Pieces.of(points)
+    candidates = up_candidates(pieces)
     directions = np.stack([direction for direction, _ in candidates])
-    grounds = np.array([ground_share(points, direction) for direction in directions])
-    standing = standing_shares(points, directions)
+    grounds = np.array([ground_share(pieces, direction) for direction in directions])
+    standing = standing_shares(pieces, directions)
     plain = np.array([score + look(direction) for direction, score in candidates])
     # Elsewhere there are no walls to tell from a floor.
     scores = plain + np.where(grounds > _WALL, standing * grounds, 0)
@@ -96,14 +96,7 @@ def find_upward(points: Points, look: Callable[[Points], float]) -> UpwardDirect
     return UpwardDirections(directions[kept], scores[kept], grounds[kept], bool(reliable))
 
 
-def _normals(neighborhoods: NDArray) -> tuple[Points, Points]:
-    """Unit normals ``[M, 3]`` of neighborhoods ``[M, k, 3]``, and how flat they are ``[M]`` in 0..1."""
-    offsets = neighborhoods - neighborhoods.mean(1, keepdims=True)
-    values, vectors = np.linalg.eigh(np.einsum("mki,mkj->mij", offsets, offsets))
-    return vectors[:, :, 0], 1 - np.clip(values[:, 0] / np.maximum(values[:, 1], 1e-12), 0, 1)
-
-
-def up_candidates(points: Points) -> list[tuple[Points, float]]:
+def up_candidates(pieces: Pieces) -> list[tuple[Points, float]]:
     """Directions that may be up, with scores.
 
     They are the normals of the largest planes, either way, and the directions of the usual conventions. A direction
@@ -111,12 +104,10 @@ def up_candidates(points: Points) -> list[tuple[Points, float]]:
     stands above them; by how low the points lie; and a little by convention.
 
     Args:
-        points: Solid points ``[M, 3]`` of the middle of the scene.
+        pieces: Surfaces of the middle of the scene.
     """
-    distances, neighbors = cKDTree(points).query(points, k=_NEIGHBORS)
-    normals, flatness = _normals(points[neighbors])
-    reach = distances[:, -1]
-    areas = np.minimum(reach, 3 * np.median(reach)) ** 2 * flatness
+    normals, reach = pieces.normals, pieces.reach
+    areas = np.minimum(reach, 3 * np.median(reach)) ** 2 * pieces.flatness
     shares = areas / max(float(areas.sum()), 1e-300)
     candidates = [np.array(axis, float) for axis in _CONVENTIONS]
     left = shares.copy()
@@ -130,14 +121,14 @@ def up_candidates(points: Points) -> list[tuple[Points, float]]:
             break
         candidates += [mean / np.linalg.norm(mean), -mean / np.linalg.norm(mean)]
         left = np.where(near, 0, left)
-    return [(candidate, _up_score(points, normals, shares, candidate)) for candidate in candidates]
+    return [(candidate, _up_score(pieces, shares, candidate)) for candidate in candidates]
 
 
-def _up_score(points: Points, normals: Points, shares: Points, up: Points) -> float:
-    heights = points @ up
+def _up_score(pieces: Pieces, shares: Points, up: Points) -> float:
+    heights = pieces.points @ up
     low, high = np.quantile(heights, [LOW, 1 - LOW])
     level = (heights - low) / max(high - low, 1e-12)
-    across = np.where(np.abs(normals @ up) > _TILTED, shares, 0)
+    across = np.where(np.abs(pieces.normals @ up) > _TILTED, shares, 0)
     floor = float(across[level < 0.33].sum() - across[level > 0.67].sum())
     standing = float(((level > 0.33) & (level < 0.67)).mean() - (level > 0.67).mean())
     lying = 0.5 - float(np.median(level))
@@ -145,25 +136,24 @@ def _up_score(points: Points, normals: Points, shares: Points, up: Points) -> fl
     return floor + 0.5 * standing + lying + (0.2 if usual > math.cos(math.radians(20)) else 0.0)
 
 
-def ground_share(points: Points, up: Points) -> float:
+def ground_share(pieces: Pieces, up: Points) -> float:
     """Share of a scene, as seen from above, under which a level ground lies, in 0..1.
 
     The ground is the slab in the lower third that holds most pieces of surface across the up direction.
 
     Args:
-        points: Solid points ``[M, 3]`` of the middle of the scene.
+        pieces: Surfaces of the middle of the scene.
         up: The up direction ``[3]``, of unit length.
     """
-    normals, flatness = _normals(points[cKDTree(points).query(points, k=_NEIGHBORS)[1]])
-    heights = points @ up
+    heights = pieces.points @ up
     low, high = np.quantile(heights, [LOW, 1 - LOW])
-    level = (np.abs(normals @ up) > _TILTED) & (flatness > 0.5) & (heights < low + (high - low) / 3)
+    level = (np.abs(pieces.normals @ up) > _TILTED) & (pieces.flatness > 0.5) & (heights < low + (high - low) / 3)
     half = _GROUND_HEIGHT * (high - low)
     if not level.any() or half <= 0:
         return 0.0
     counts, edges = np.histogram(heights[level], max(1, math.ceil(float(np.ptp(heights[level])) / half)))
     middle = edges[counts.argmax()] + half / 2
-    footprint = points @ np.stack(upright_frame(up)[:2]).T
+    footprint = pieces.points @ np.stack(upright_frame(up)[:2]).T
     first, last = np.quantile(footprint, [0.02, 0.98], axis=0)
     cells = np.floor((footprint - first) / max(float((last - first).max()) / _GROUND_CELLS, 1e-300))
     ground = level & (np.abs(heights - middle) < half)
