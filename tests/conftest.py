@@ -1,5 +1,9 @@
-"""Fixtures shared by the tests."""
+"""Fixtures shared by the tests.
 
+Nothing heavy is imported here: with pytest-xdist the process that hands out the tests reads this file, too.
+"""
+
+import gc
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -16,11 +20,12 @@ from filelock import FileLock
 from support.tiny_capture import QUICK_BUILD, write_capture
 
 import lexsplat  # noqa: F401  (before torch: it sets how torch's threads wait)
-from lexsplat.runtime import device as threads
 
 # A loaded machine may take any time for an example.
 hypothesis.settings.register_profile("lexsplat", deadline=None)
 hypothesis.settings.load_profile("lexsplat")
+
+gc.disable()  # until all tests are imported: nearly nothing of what is imported is ever freed
 
 TEST_DATA = Path(os.environ.get("LEXSPLAT_TEST_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
@@ -44,6 +49,11 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
 
 
+def pytest_collection_finish():
+    gc.enable()
+    gc.freeze()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def own_cache(tmp_path_factory) -> Iterator[None]:
     """A folder of the tests' own for what lexsplat keeps for the user."""
@@ -55,6 +65,8 @@ def own_cache(tmp_path_factory) -> Iterator[None]:
 @pytest.fixture
 def one_thread():
     """For tensors so small that threads would only wait for each other; also undoes what a test sets."""
+    from lexsplat.runtime import device as threads
+
     with threads.one_thread():
         yield
 

@@ -19,6 +19,7 @@ from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.viewpoints import choosing
 from lexsplat.pipeline.viewpoints.looking import look_from_above
 from lexsplat.pipeline.viewpoints.surroundings import Surroundings, find_surroundings
+from lexsplat.pipeline.viewpoints.pieces import Pieces
 from lexsplat.pipeline.viewpoints.upward import ground_share
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.scenes.folder import SceneFolder
@@ -96,8 +97,8 @@ def test_the_up_direction_of_a_thing_alone_is_a_guess_and_contradicts_nobody(tmp
 
 def test_a_ground_is_level_and_wide():
     """The table top is under the whole scene; caps of a ball within 15 degrees of level have 7 % of its outline."""
-    assert ground_share(on_table(), UP) > 0.9
-    assert ground_share(ball(), UP) < 0.1
+    assert ground_share(Pieces.of(on_table()), UP) > 0.9
+    assert ground_share(Pieces.of(ball()), UP) < 0.1
     assert surroundings(solid(on_table())).up.reliable
 
 

@@ -10,7 +10,6 @@ import resource
 import shutil
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -19,18 +18,6 @@ from lexsplat import cli
 from lexsplat.scenes.scene import open_scene
 
 pytestmark = pytest.mark.slow
-
-LONGEST = 3000
-"""Seconds after which a command hangs, however busy the machine is: a build takes ten when it is not."""
-
-LIMITED = """
-import resource, signal, sys
-from lexsplat import cli
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # a write beyond the limit is an error instead of the end
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), int(sys.argv[1])))
-sys.exit(cli.main(sys.argv[2:]))
-"""
-
 
 @pytest.fixture
 def small_disk(tmp_path):
@@ -114,21 +101,25 @@ def test_a_scene_on_a_full_disk_stays_as_it_was(built, small_disk, tmp_path):
     open_scene(scene, device="cpu")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def run_limited():
     """Runs the command line so that no file can become larger than so many bytes: a full disk without a mount."""
     if not hasattr(resource, "RLIMIT_FSIZE") or not hasattr(signal, "SIGXFSZ"):
         pytest.skip("no limit of file sizes on this system")
 
-    def command(size: int, *arguments: str) -> subprocess.CompletedProcess:
-        return subprocess.run(
-            [sys.executable, "-c", LIMITED, str(size), *arguments],
-            capture_output=True,
-            text=True,
-            timeout=LONGEST,
-        )
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
 
-    return command
+    def command(size: int, *arguments: str) -> subprocess.CompletedProcess:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
+            return run(*arguments)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    # A write beyond the limit is an error instead of the end.
+    told = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    yield command
+    signal.signal(signal.SIGXFSZ, told)
 
 
 @pytest.mark.parametrize("size", [200, 3_000, 60_000])

@@ -64,13 +64,17 @@ def attempt(
 
 def main() -> None:
     folder, kills, seed, stages, *options = sys.argv[1:]
+    import torch._dynamo  # by the first optimizer
     import transformers.models.auto.tokenization_auto
     import transformers.models.clip.modeling_clip
     import transformers.models.vit.modeling_vit  # noqa: F401  (imported once, before the first fork)
 
     rng, names = np.random.default_rng(int(seed)), stages.split(",")
-    report = {"killed_inside": [], "kills": 0, "finished": []}
-    while report["kills"] < int(kills):
+    undisturbed = str(Path(folder) / "undisturbed")
+    report = {"killed_inside": [], "kills": 0, "finished": [], "undisturbed": undisturbed}
+    if attempt([*options, "--output", undisturbed]) != "finished":
+        report["failed"] = undisturbed
+    while report["kills"] < int(kills) and "failed" not in report:
         output = Path(folder) / f"scene_{len(report['finished'])}"
         arguments = [*options, "--output", str(output)]
         stage, share = names[len(report["finished"]) % len(names)], float(rng.uniform())
@@ -87,8 +91,8 @@ def main() -> None:
             result = attempt(arguments)
         if result == "failed":
             report["failed"] = str(output)
-            break
-        report["finished"].append(str(output))
+        else:
+            report["finished"].append(str(output))
     print(json.dumps(report))
 
 

@@ -7,7 +7,6 @@ kinds are random, or enumerate the structure of the format.
 
 from __future__ import annotations
 
-import copy
 import json
 import struct
 from collections.abc import Callable, Iterator
@@ -151,7 +150,7 @@ def structure(document: Any, rng: np.random.Generator, limit: int = 600) -> Iter
     chosen = rng.permutation(len(changes))[:limit]
     for index in sorted(chosen.tolist()):
         path, change = changes[index]
-        data = _changed(copy.deepcopy(document), path, change)
+        data = _changed(document, path, change)
         # Lone surrogates cannot be encoded as UTF-8, but a file can contain them as escapes.
         yield "structure", json.dumps(data, ensure_ascii=bool(index % 2)).encode("utf-8", "surrogatepass")
 
@@ -164,16 +163,15 @@ def _places(node: Any, path: tuple = ()) -> Iterator[list]:
 
 
 def _changed(document: Any, path: list, change: Callable[[Any], Any] | None) -> Any:
+    """A document with another value at a path; what is not on the path is shared with the old one."""
     if not path:
         return None if change is None else change(document)
-    parent = document
-    for key in path[:-1]:
-        parent = parent[key]
-    if change is None:
-        del parent[path[-1]]
+    copied, (key, *rest) = document.copy(), path
+    if change is None and not rest:
+        del copied[key]
     else:
-        parent[path[-1]] = change(parent[path[-1]])
-    return document
+        copied[key] = _changed(document[key], rest, change)
+    return copied
 
 
 def json_file(
