@@ -109,6 +109,7 @@ def test_an_invalid_capture_leaves_an_existing_folder_unchanged(built, tmp_path,
     assert (mine / "notes.txt").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_downscale_that_is_too_large_is_refused_before_training(tiny_capture, tmp_path, capsys):
     arguments = ["build", str(tiny_capture), "--output", str(tmp_path / "out"), *QUICK]
     fails_in_one_line(capsys, [*arguments, "--downscale", "100"], "6 pixels", "--downscale")

@@ -84,14 +84,16 @@ def test_points_project_to_where_they_were_seen(name):
     model = pycolmap.Reconstruction(CAPTURES / name / "sparse" / "0")
     (camera,) = model.cameras.values()
     K = camera.calibration_matrix()
+    places = {number: point.xyz for number, point in model.points3D.items()}
     errors = []
     for image in model.images.values():
         world_to_camera = image.cam_from_world().matrix()
-        for seen in image.points2D:
-            x, y, z = K @ world_to_camera @ np.append(model.points3D[seen.point3D_id].xyz, 1)
-            assert z > 0
-            errors.append(np.hypot(x / z - seen.xy[0], y / z - seen.xy[1]))
-    assert np.mean(errors) < 1.0
+        points = np.array([[*places[seen.point3D_id], 1.0] for seen in image.points2D]).reshape(-1, 4)
+        x, y, z = K @ world_to_camera @ points.T
+        assert (z > 0).all()
+        found = np.array([seen.xy for seen in image.points2D]).reshape(-1, 2)
+        errors.append(np.hypot(x / z - found[:, 0], y / z - found[:, 1]))
+    assert np.mean(np.concatenate(errors)) < 1.0
 
 
 def test_masks_are_binary_nonempty_and_of_the_pictures_size(name):

@@ -82,6 +82,7 @@ def test_the_light_tower_equals_transformers_at_the_size_of_vit_b_16(clip_folder
     assert_same_embeddings(folder)
 
 
+@pytest.mark.slow
 def test_what_the_light_tower_does_not_know_is_left_to_transformers(clip_folder, tmp_path):
     def refused(**text) -> bool:
         place = tmp_path / str(len(list(tmp_path.iterdir())))

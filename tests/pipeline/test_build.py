@@ -77,6 +77,7 @@ def test_stages_are_those_of_the_method_and_a_second_build_keeps_all(
     assert stages_run(tiny_capture, copy, config) == dict.fromkeys(expected, True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("base", "change", "redone"),
     [
@@ -117,6 +118,7 @@ def test_a_build_stops_after_the_stage_asked_for(tiny_capture, tmp_path):
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.slow
 def test_joint_training_makes_features_and_codes_before_the_geometry(tiny_capture, tmp_path):
     joint = replace(TRAINED, joint=True)
     finished = stages_run(tiny_capture, tmp_path / "scene", joint)

@@ -138,6 +138,7 @@ def test_the_time_of_the_features_is_told_first(clip_folder, tmp_path, caplog):
     assert "words match bundled images by" in caplog.text, "random weights match no words"
 
 
+@pytest.mark.slow
 def test_a_build_that_stops_for_its_encoder_goes_on_from_what_was_finished(
     tiny_capture, tmp_path, monkeypatch
 ):

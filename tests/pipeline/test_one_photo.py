@@ -62,6 +62,7 @@ def test_splats_of_one_photo_are_looked_at_from_near_it_with_a_warning(caplog, m
     assert chosen.unseen < 0.1 * chosen.visible
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "refused"), [(0.1, True), (0.5, False)])
 def test_few_views_that_hide_most_of_what_can_be_seen_are_refused(monkeypatch, share, refused):
     """Three good views show a share of what all candidates show."""

@@ -99,9 +99,14 @@ def test_a_ground_is_level_and_wide():
     """The table top is under the whole scene; caps of a ball within 15 degrees of level have 7 % of its outline."""
     assert ground_share(Pieces.of(on_table()), UP) > 0.9
     assert ground_share(Pieces.of(ball()), UP) < 0.1
+
+
+@pytest.mark.slow
+def test_the_up_direction_of_a_thing_on_a_ground_is_reliable():
     assert surroundings(solid(on_table())).up.reliable
 
 
+@pytest.mark.slow
 def test_a_scene_as_small_as_the_near_plane_is_refused_with_a_remedy():
     table = on_table() - [0, 0, 0.1]
     with pytest.raises(CaptureError) as caught:

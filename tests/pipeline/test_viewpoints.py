@@ -19,7 +19,7 @@ from lexsplat.geometry.rotations import rotation_about
 from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.inputs import reload_capture
-from lexsplat.pipeline.viewpoints import choosing, stage
+from lexsplat.pipeline.viewpoints import candidates, choosing, stage
 from lexsplat.pipeline.viewpoints.choosing import choose_views
 from lexsplat.pipeline.viewpoints.floaters import find_floaters, isolation
 from lexsplat.pipeline.viewpoints.looking import look, surface_share
@@ -35,6 +35,7 @@ UP = np.array([0.0, 0.0, 1.0])
 def _few_candidates(monkeypatch) -> None:
     """Choices of a test take seconds."""
     monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 60)
+    monkeypatch.setattr(candidates, "_MOST_PLACES", 20)
 
 
 def on_sphere(center, radius: float, count: int, seed: int) -> np.ndarray:

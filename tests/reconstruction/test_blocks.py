@@ -370,6 +370,7 @@ def test_auto_takes_as_few_blocks_as_fit():
             number_of_blocks(wrong, config, "cpu", need)
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_goes_on_after_the_last_finished_visit_with_the_same_result(
     capture, points, tmp_path, monkeypatch
 ):

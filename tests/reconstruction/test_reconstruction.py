@@ -46,6 +46,7 @@ def trained(capture, points):
     return trainer, before
 
 
+@pytest.mark.slow
 def test_held_out_views_become_sharp(capture, trained):
     trainer, before = trained
     assert held_out_psnr(trainer, capture) > max(18.0, before + 6.0)
