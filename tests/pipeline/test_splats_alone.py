@@ -18,8 +18,8 @@ from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.viewpoints import choosing
 from lexsplat.pipeline.viewpoints.looking import look_from_above
-from lexsplat.pipeline.viewpoints.surroundings import Surroundings, find_surroundings
 from lexsplat.pipeline.viewpoints.pieces import Pieces
+from lexsplat.pipeline.viewpoints.surroundings import Surroundings, find_surroundings
 from lexsplat.pipeline.viewpoints.upward import ground_share
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.scenes.folder import SceneFolder

@@ -88,7 +88,9 @@ def test_shelves_that_touch_a_wall_as_well_as_the_floor_make_up_a_guess_that_con
 
 
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("name", [name for name in (FREE | AMBIGUOUS) if name not in ("another library", "one more")])
+@pytest.mark.parametrize(
+    "name", [name for name in (FREE | AMBIGUOUS) if name not in ("another library", "one more")]
+)
 def test_however_a_room_of_shelves_is_turned_up_is_right_or_a_guess(name, seed):
     """The seed also makes the points, so the three libraries are one."""
     turn = Rotation.random(random_state=seed).as_matrix()

@@ -142,7 +142,8 @@ def test_what_rests_on_something_or_is_beside_it_is_not_under_it(things, first, 
 def test_on_and_under_exclude_each_other_both_ways(things):
     pairs = list(itertools.permutations(things, 2))
     on, under = (
-        {pair: holds(relation, *map(things.get, pair), FRAME) for pair in pairs} for relation in ("on", "under")
+        {pair: holds(relation, *map(things.get, pair), FRAME) for pair in pairs}
+        for relation in ("on", "under")
     )
     for pair in pairs:
         assert not (on[pair] and under[pair]), pair

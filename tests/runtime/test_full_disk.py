@@ -19,6 +19,7 @@ from lexsplat.scenes.scene import open_scene
 
 pytestmark = pytest.mark.slow
 
+
 @pytest.fixture
 def small_disk(tmp_path):
     """A file system in memory with room for 600 kB."""

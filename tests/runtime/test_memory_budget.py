@@ -103,7 +103,9 @@ def by_both_methods(tmp_path_factory) -> Path:
     ],
 )
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the hard limit (RLIMIT_DATA) needs Linux")
-def test_a_build_stays_under_a_hard_limit_that_its_photos_exceed(large_capture, by_both_methods, method, stages):
+def test_a_build_stays_under_a_hard_limit_that_its_photos_exceed(
+    large_capture, by_both_methods, method, stages
+):
     limit = MEMORY + BESIDE
     assert limit < VIEWS * WIDTH * HEIGHT * 3 * 4, "the decoded photos must not fit"
     done = run(large_capture, by_both_methods, limit, "--memory", f"{MEMORY}", "--method", method)

@@ -147,7 +147,9 @@ def ground_share(pieces: Pieces, up: Points) -> float:
     """
     heights = pieces.points @ up
     low, high = np.quantile(heights, [LOW, 1 - LOW])
-    level = (np.abs(pieces.normals @ up) > _TILTED) & (pieces.flatness > 0.5) & (heights < low + (high - low) / 3)
+    level = (
+        (np.abs(pieces.normals @ up) > _TILTED) & (pieces.flatness > 0.5) & (heights < low + (high - low) / 3)
+    )
     half = _GROUND_HEIGHT * (high - low)
     if not level.any() or half <= 0:
         return 0.0
