@@ -68,7 +68,7 @@ def test_a_box_around_a_rotated_block_has_the_size_and_center_of_the_block(angle
     block = turned(angle, center=(1.0, -2.0, 3.0))
     points = block.center + (rng.uniform(-1, 1, (4000, 3)) * block.half_sizes) @ block.axes
     for found in (fit_box(points, UP), trimmed_box(points, UP, 0.0)):
-        assert np.sort(found.half_sizes[:2]) == pytest.approx([0.5, 1.0], rel=0.08)
+        assert np.sort(found.half_sizes[:2]) == pytest.approx([0.5, 1.0], rel=0.12)
         assert found.half_sizes[2] == pytest.approx(0.25, rel=0.02)
         assert found.center == pytest.approx(block.center, abs=0.05)
         assert np.linalg.det(found.axes) == pytest.approx(1.0)
