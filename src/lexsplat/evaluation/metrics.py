@@ -97,36 +97,25 @@ def load_lpips(device: str = "cpu") -> tuple[Perceptual | None, str | None]:
 # Relevancy maps, strict protocol
 
 
-def precision_recall(scores: ArrayLike, ground_truth: ArrayLike) -> tuple[NDArray, NDArray, NDArray]:
-    """Precision and recall at every distinct score, from the highest threshold to the lowest.
-
-    Returns:
-        ``(precisions, recalls, thresholds)``, each ``[T]``; a pixel is predicted when its score is
-        at least the threshold.
-
-    Raises:
-        ValueError: If shapes differ, a score is NaN or infinite, or the ground truth is empty.
-    """
-    values, mask = _scores(scores, ground_truth)
-    positives = np.count_nonzero(mask)
-    if not positives:
-        raise ValueError("precision and recall need at least one pixel of ground truth")
-    order = np.argsort(-values)  # not stable, which is faster: only the ends of ties are read
-    ranked = values[order]
-    last = np.flatnonzero(np.append(ranked[1:] != ranked[:-1], True))
-    hits = np.cumsum(mask[order])[last]
-    return hits / (last + 1), hits / positives, ranked[last]
-
-
 def average_precision(scores: ArrayLike, ground_truth: ArrayLike) -> float:
     """Strict average precision: mean over 101 recalls of the best precision at that recall or a higher one.
 
+    A pixel is predicted when its score is at least the threshold. Of all thresholds with the same hits, the score of
+    a hit predicts the fewest pixels, so only those thresholds are tried.
+
     Returns:
         A number in 0..1; NaN if the ground truth is empty.
+
+    Raises:
+        ValueError: If shapes differ, or a score is NaN or infinite.
     """
-    if not np.asarray(ground_truth).any():
+    values, mask = _scores(scores, ground_truth)
+    if not mask.any():
         return math.nan
-    precisions, recalls, _ = precision_recall(scores, ground_truth)
+    ranked, hits = np.sort(values), np.sort(values[mask])
+    found = np.arange(len(hits), 0, -1)  # from the lowest threshold to the highest; of ties the first one counts
+    predicted = len(ranked) - np.searchsorted(ranked, hits, side="left")
+    precisions, recalls = (found / predicted)[::-1], (found / len(hits))[::-1]
     return float(interpolated_precision(precisions, recalls).mean())
 
 
