@@ -28,6 +28,7 @@ from PIL import Image
 from records import argument_parser
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
+from transformers import CLIPModel
 
 from lexsplat.evaluation.demo import demo_capture
 from lexsplat.features.clip import ClipEncoder
@@ -165,7 +166,9 @@ def make_web_like(folder: Path, seed: int = 0, facts: Facts = Facts(), private: 
     if not isinstance(bundled, ClipEncoder):
         raise TypeError("the bundled encoder is a ClipEncoder")
     phrases = general_phrases(held_out=False)
-    model, sample = bundled._model, _sample(bundled, phrases.texts)
+    source = Path(model_folder("bundled", "clip"))
+    model = CLIPModel.from_pretrained(source)
+    sample = _sample(bundled, model, phrases.texts)
     draw = torch.Generator().manual_seed(seed)
     image = _Tower(model.vision_model.post_layernorm, model.visual_projection, sample.varied)
     text = _Tower(model.text_model.final_layer_norm, model.text_projection, sample.phrases, phrases.weights)
@@ -184,7 +187,7 @@ def make_web_like(folder: Path, seed: int = 0, facts: Facts = Facts(), private: 
     model.visual_projection, model.text_projection = _layer(rotation @ rows), _layer(rotation @ words)
     model.config.projection_dim = width
     model.save_pretrained(folder)
-    for path in Path(model_folder("bundled", "clip")).glob("*.json"):
+    for path in source.glob("*.json"):
         if path.name != "config.json":
             shutil.copy(path, folder)
     return folder
@@ -301,9 +304,9 @@ def _layer(weight: Tensor) -> nn.Linear:
 
 
 @torch.no_grad()
-def _sample(encoder: ClipEncoder, phrases: Sequence[str], seed: int = 0) -> Sample:
+def _sample(encoder: ClipEncoder, model: CLIPModel, phrases: Sequence[str], seed: int = 0) -> Sample:
     """Hidden states of crops of the second bundled capture and of phrases."""
-    model, rng = encoder._model, np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     photos, side = _photos(demo_capture("second") / "images"), encoder.image_size
 
     def images(pixels: Tensor) -> Tensor:

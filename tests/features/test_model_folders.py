@@ -15,6 +15,7 @@ from support.refusals import assert_tells
 from support.siglip_folder import siglip_folder
 
 from lexsplat.features import hub
+from lexsplat.features.clip_image import ClipImages
 from lexsplat.features.encoders import load_clip, load_dino
 from lexsplat.runtime.errors import ModelError
 
@@ -51,12 +52,32 @@ def assert_same_model(found, folder: Path) -> None:
     """Assert that every tensor is that of transformers' own loading of a folder."""
     from transformers import AutoModel
 
-    expected = AutoModel.from_pretrained(folder).state_dict()
-    state = found._model.state_dict()
+    model = AutoModel.from_pretrained(folder)
+    expected, state = dict(model.state_dict()), dict(found._model.state_dict())
+    if (
+        getattr(found, "_images", None) is not None
+    ):  # the tensors of its image tower, as lexsplat arranges them
+        expected = {name: value for name, value in expected.items() if not name.startswith("vision_model")}
+        expected |= tensors_of(ClipImages(model))
+        state |= tensors_of(found._images)
     assert {name for name in expected if "pooler" not in name} <= set(state)
     for name, tensor in state.items():
         if "pooler" not in name:
             torch.testing.assert_close(tensor, expected[name], atol=0, rtol=0)
+
+
+def tensors_of(value, name: str = "images") -> dict[str, torch.Tensor]:
+    """All tensors in an object, by their place in it."""
+    if isinstance(value, torch.Tensor):
+        return {name: value}
+    if isinstance(value, torch.nn.Module):
+        return {f"{name}.{key}": tensor for key, tensor in value.state_dict().items()}
+    parts = dict(enumerate(value)) if isinstance(value, list) else getattr(value, "__dict__", {})
+    return {
+        key: tensor
+        for part, one in parts.items()
+        for key, tensor in tensors_of(one, f"{name}.{part}").items()
+    }
 
 
 # -- what loads

@@ -22,6 +22,7 @@ from mcp.server import MCPServer
 from support.mcp_clients import ask, served, talk
 from support.schemas import validated
 
+from lexsplat import open_scene
 from lexsplat.mcp.server import http_app, make_server
 from lexsplat.runtime.files import read_json
 from lexsplat.scenes.folder import BUNDLED_SCENE
@@ -262,7 +263,8 @@ def test_tools_that_write_are_offered_on_demand_and_write_new_files_in_one_folde
     assert [path.name for path in tmp_path.rglob("*.ply")] == ["duck.ply"]
     reply, _ = ask(server, "edit", action="delete", phrase="rubber duck", folder="without")
     assert not reply.is_error
-    assert (tmp_path / "output" / "without" / "scene.json").exists()
+    answers = open_scene(tmp_path / "output" / "without").ask(["rubber duck", "red apple"])
+    assert [answer["present"] for answer in answers.to_dict()["answers"]] == ["no", "yes"]
 
 
 @pytest.mark.slow

@@ -113,7 +113,9 @@ def average_precision(scores: ArrayLike, ground_truth: ArrayLike) -> float:
     if not mask.any():
         return math.nan
     ranked, hits = np.sort(values), np.sort(values[mask])
-    found = np.arange(len(hits), 0, -1)  # from the lowest threshold to the highest; of ties the first one counts
+    found = np.arange(
+        len(hits), 0, -1
+    )  # from the lowest threshold to the highest; of ties the first one counts
     predicted = len(ranked) - np.searchsorted(ranked, hits, side="left")
     precisions, recalls = (found / predicted)[::-1], (found / len(hits))[::-1]
     return float(interpolated_precision(precisions, recalls).mean())

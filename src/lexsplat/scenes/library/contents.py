@@ -25,6 +25,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.rotations import matrices_from_quaternions
 from lexsplat.language.segment_codes import segment_codes
 from lexsplat.language.segments import Segments
 from lexsplat.rendering import render
@@ -47,6 +48,8 @@ _BEHIND = 0.05
 _NEIGHBORS = 8
 _FAINT = 0.1
 """Gaussians of lower opacity link nothing, as in `lexsplat.queries.selection`."""
+
+_UPPER = np.triu_indices(3)
 
 Array = NDArray[Any]
 
@@ -82,6 +85,8 @@ class Contents:
         ends: Where the files of the images end ``[W]`` int32.
         pictures: The files, JPEG, one after the other, uint8.
         facts: Names of the images ("views"), up direction ("world"), and the objects with name, place and size.
+        spreads: Symmetric square roots of the covariances of the points (xx, xy, xz, yy, yz, zz) ``[M, 6]`` float16,
+            world units; None in libraries that were made before boxes took them into account.
     """
 
     levels: Tensor
@@ -110,12 +115,14 @@ class Contents:
     ends: Tensor
     pictures: Tensor
     facts: Mapping[str, Any]
+    spreads: Tensor | None = None
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name; the facts as bytes of JSON."""
         names = [field.name for field in dataclasses.fields(self) if field.name != "facts"]
         text = json.dumps(self.facts, ensure_ascii=False, sort_keys=True).encode("utf-8")
-        return {**{name: getattr(self, name) for name in names}, "facts": _bytes(text)}
+        kept = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return {**kept, "facts": _bytes(text)}
 
     def content(self) -> str:
         """A hash of all values."""
@@ -125,6 +132,14 @@ class Contents:
         """The camera of an image."""
         width, height = self.sizes[number].tolist()
         return Camera(width, height, self.intrinsics[number].numpy(), self.poses[number].numpy())
+
+    def spreads_of(self, rows: Array) -> Array | None:
+        """Square roots of the covariances of points ``[m, 3, 3]``; None if the library has none."""
+        if self.spreads is None:
+            return None
+        whole, (first, second) = np.zeros((len(rows), 3, 3)), _UPPER
+        whole[:, first, second] = whole[:, second, first] = self.spreads.numpy()[rows]
+        return whole
 
     def picture(self, number: int) -> Image.Image:
         """An image of the scene."""
@@ -263,7 +278,9 @@ def _points(scene: Scene, segments: Segments) -> dict[str, Tensor]:
         labels[order]
     ]  # every second or third of them, and so on
     chosen = order[rank % np.maximum(step, 1) == 0]
-    means = scene.gaussians.means.detach().cpu()[torch.from_numpy(chosen)]
+    gaussians = scene.gaussians.select(torch.from_numpy(chosen).to(scene.gaussians.means.device)).detach()
+    means, rotations = gaussians.means.cpu(), matrices_from_quaternions(gaussians.quats)
+    spreads = ((rotations * gaussians.scales[:, None]) @ rotations.transpose(1, 2)).cpu()
     of = labels[chosen]
     kept = np.bincount(of, minlength=count)
     sums = np.stack([np.bincount(of, means[:, axis].double().numpy(), count) for axis in range(3)], 1)
@@ -272,7 +289,8 @@ def _points(scene: Scene, segments: Segments) -> dict[str, Tensor]:
         "centers": centers,
         "starts": torch.from_numpy(np.concatenate([[0], np.cumsum(kept)])).int(),
         "offsets": (means - centers[torch.from_numpy(of)]).half(),
-        "weights": scene.gaussians.opacities.detach().cpu()[torch.from_numpy(chosen)].half(),
+        "weights": gaussians.opacities.cpu().half(),
+        "spreads": spreads[:, _UPPER[0], _UPPER[1]].half(),
         "means": means,
     }
 

@@ -41,8 +41,6 @@ from lexsplat.scenes.library.contents import Contents, projected
 
 _LARGE = 0.05
 """Phrases without an everyday name that select this share of a scene are left to it."""
-_BOXED = 400
-"""Points that a box is fitted to, at most."""
 
 Array = NDArray[Any]
 
@@ -268,7 +266,8 @@ def _instance(
     # A point stands for the Gaussians of its segment that are not kept.
     weights = contents.weights.numpy()[rows].astype(np.float64) * contents.counts.numpy()[of] / kept
     up = np.array(contents.facts["world"]["up"]["direction"], np.float64)
-    box, opacities = fit_box(points[representatives(weights, _BOXED)], up), contents.opacities.numpy()[part]
+    chosen, opacities = representatives(weights), contents.opacities.numpy()[part]
+    box = fit_box(points[chosen], up, contents.spreads_of(rows[chosen]))
     view, frame = _best_view(contents, part)
     data = {
         "name": name,
