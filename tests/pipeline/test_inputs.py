@@ -111,7 +111,7 @@ def test_a_run_that_was_stopped_goes_on_with_its_features(tmp_path):
         poses_from_photos(folder, output, listener=stop)
     assert (output / ".poses" / "database.db").is_file()
     assert not (output / "sparse").exists()
-    # Nothing is left to be seen in the photos: what is placed now is placed by features that were kept.
+    # Nothing is left to be seen in the photos: what is registered now is registered by features that were kept.
     for file in folder.iterdir():
         times, size = file.stat().st_mtime_ns, file.stat().st_size
         Image.new("RGB", SIZE).save(file)

@@ -417,7 +417,7 @@ def test_numbers_are_words_that_only_a_vocabulary_knows():
 
 
 @pytest.mark.parametrize(
-    ("text", "expected", "mended"),
+    ("text", "expected", "right"),
     [
         ("teh mug", MUG, "the"),
         ("whre is the mug?", MUG, "where"),
@@ -429,10 +429,10 @@ def test_numbers_are_words_that_only_a_vocabulary_knows():
         ("yelow mug", Thing("yellow mug"), "yellow"),
     ],
 )
-def test_typing_errors_in_the_words_of_a_question_are_mended_and_told(text, expected, mended):
+def test_typing_errors_in_the_words_of_a_question_are_corrected_and_noted(text, expected, right):
     understood = understand(text)
     assert understood.phrase == expected
-    assert f'asked for "{mended}"' in understood.note
+    assert f'asked for "{right}"' in understood.note
 
 
 @pytest.mark.parametrize(

@@ -70,11 +70,11 @@ def test_several_failures_are_one_error_that_names_them():
     [
         (
             OSError(28, "No space left on device", "/x/y"),
-            "found No space left on device: /x/y; mend this and run",
+            "found No space left on device: /x/y; fix this and run",
         ),
         (MemoryError(), "found no memory left; give a smaller --memory"),
-        (ValueError("no such axis"), "found ValueError: no such axis; mend this and run"),
-        (RuntimeError("bad shape"), "found RuntimeError: bad shape; mend this and run"),
+        (ValueError("no such axis"), "found ValueError: no such axis; fix this and run"),
+        (RuntimeError("bad shape"), "found RuntimeError: bad shape; fix this and run"),
     ],
 )
 def test_any_error_of_a_task_is_told_with_its_name_and_the_rest_is_kept(error, told):

@@ -156,7 +156,7 @@ def test_a_kind_is_compared_by_the_names_of_its_members_as_the_scenes_answer_it(
     assert {"toy", "rubber duck", "teddy bear", "toy car"} <= set(compared["toy"])
     assert compared["mug"] == ("mug",)
     typed = spellings_of(understand("tyos").phrase, "bundled")["tyos"]
-    assert {"toy", "rubber duck", "teddy bear"} <= set(typed), "what is mended is compared as well"
+    assert {"toy", "rubber duck", "teddy bear"} <= set(typed), "corrections are compared as well"
 
 
 def test_the_order_and_the_bits_of_an_answer_do_not_depend_on_the_number_of_threads(rooms):

@@ -243,7 +243,7 @@ def answering(status: int, body: object, wait: threading.Event | None = None):
         (200, "0.4.22", "expected Chroma with API 1.x, found '0.4.22'; use Chroma 1"),
         (200, {"hello": 1}, "expected Chroma with API 1.x"),
         (404, "gone", "found status 404"),
-        (507, {"message": "disk full"}, 'disk full"}; the library is whole: mend the server, then run'),
+        (507, {"message": "disk full"}, 'disk full"}; the library is whole: fix the server, then run'),
         (500, "x" * 9999, "found status 500"),
     ],
 )

@@ -235,7 +235,7 @@ _NO_ERRORS = frozenset(re.findall(r"[a-z]+", " ".join(pattern for pattern, _ in 
 
 
 def with_asking_words(text: str) -> tuple[str, dict[str, str]]:
-    """A question with the typing errors in its question words and colors mended, and what was mended."""
+    """A question with the typing errors in its question words and colors corrected, and the corrections."""
     wrong = frame_errors(text, _FRAME, _vocabulary(), _NO_ERRORS)
     return re.sub(r"[^\W\d_]+", lambda word: wrong.get(word[0], word[0]), text), wrong
 

@@ -64,7 +64,7 @@ class Contents:
         rows: First entry of each segment in the two next tensors ``[S + 1]`` int32.
         columns: Codes that occur in each segment, int16.
         shares: Their shares, float16.
-        places: Mean distributions over the codes of the objects ``[V, K]`` float16, where presence is judged.
+        places: Mean distributions over the codes of the objects ``[V, K]`` float16, where presence is decided.
         mean: Mean of the everyday words ``[D]``.
         best: The best height of an everyday word at each code ``[K]``.
         best_colored: The same with the scene's objects in any color ``[K]``.

@@ -144,8 +144,8 @@ class Found:
 
     Args:
         phrase: What was asked for.
-        understood: What was searched: how it was parsed, with typing errors mended as for the first hit.
-        note: What was not understood, mended or not found; with the scenes if it does not hold for all hits.
+        understood: What was searched: how it was parsed, with typing errors corrected as for the first hit.
+        note: What was not understood, corrected or not found; with the scenes if it does not hold for all hits.
         hits: The scenes that hold it: "yes" before "unsure", then by their bounds.
         scenes: Number of scenes in the library.
         opened: Number of scenes that were asked themselves.

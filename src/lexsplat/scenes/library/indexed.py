@@ -149,7 +149,7 @@ def decidable(phrase: str, clip: str) -> Thing | None:
     thing = understood.phrase
     if not isinstance(thing, Thing) or understood.note or (clip == "bundled" and not phrase.isascii()):
         return None
-    if thing_of_part(thing.text):  # judged where its thing is described
+    if thing_of_part(thing.text):  # compared where its thing is described
         return None
     known = words_of_things(clip)
     if clip == "bundled" and strange(thing.text, known):

@@ -212,7 +212,7 @@ def _groups(library: Library, records: list[Record], phrase: Phrase) -> tuple[li
 def _bounds(library: Library, records: list[Record], phrase: Phrase) -> list[float]:
     """Bounds of a phrase in scenes of one encoder; -1 for those whose codes are damaged.
 
-    A scene mends typing errors where that helps (`Scene.understand`), so both spellings are compared.
+    A scene corrects typing errors where that helps (`Scene.understand`), so both spellings are compared.
     """
     spellings = spellings_of(phrase, records[0].clip)
     codes = [library.codes(record) for record in records]
@@ -229,7 +229,7 @@ def _bounds(library: Library, records: list[Record], phrase: Phrase) -> list[flo
 
 
 def spellings_of(phrase: Phrase, clip: str) -> dict[str, tuple[str, ...]]:
-    """The texts of the things of a phrase, each with what it may be mended to and the members of its kind."""
+    """The texts of the things of a phrase, each with its possible corrections and the members of its kind."""
     found = {}
     for text in things_of(phrase):
         meant = (text, *spellings(text, words_of_things(clip)))
