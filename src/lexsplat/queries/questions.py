@@ -324,7 +324,7 @@ def at_one_moment(words: str) -> tuple[str, str]:
 
 
 def says_more(statement: str) -> str:
-    """The word by which a statement says more than the grammar can check; "" if there is none.
+    """The word of a statement that the grammar cannot check; "" if there is none.
 
     "Is only the duck on the table?"; "are all things on the table red?" and "is the largest toy on the table red?".
     """

@@ -1,4 +1,4 @@
-"""The choice of views: those in which the splat looks like something, until nearly all visible Gaussians are seen."""
+"""Chooses views that show surfaces, until nearly all visible Gaussians are in one of them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _FEWEST_VIEWS = 8
 _SAMPLE = 40_000
 """Gaussians whose coverage is followed, at most."""
 _TIMES = 6
-"""Number of views that shall see each Gaussian: the mean over views cancels what is wrong in one."""
+"""Number of views that should see each Gaussian: the mean over views cancels the errors of single ones."""
 _SEEN = 0.1
 """Weight in pixels of a small view at which a Gaussian counts as seen: a quarter of a cell of a feature map."""
 _LEAST_GAIN = 0.001

@@ -82,7 +82,7 @@ def find_upward(points: Points, look: Callable[[Points], float]) -> UpwardDirect
     grounds = np.array([ground_share(pieces, direction) for direction in directions])
     standing = standing_shares(pieces, directions)
     plain = np.array([score + look(direction) for direction, score in candidates])
-    # Elsewhere there are no walls to tell from a floor.
+    # Without a large ground there are no walls that could be taken for a floor.
     scores = plain + np.where(grounds > _WALL, standing * grounds, 0)
     kept: list[int] = []
     for index in np.argsort(-scores, kind="stable"):

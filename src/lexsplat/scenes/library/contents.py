@@ -44,7 +44,7 @@ _IMAGES = 8
 _SIDE, _QUALITY = 320, 70
 """Longer side of an image in pixels, and quality of its JPEG."""
 _BEHIND = 0.05
-"""An image shows a point that lies at most this share of its distance behind what is drawn there."""
+"""Largest distance of a point behind the surface that an image shows there, as a share of its depth."""
 _NEIGHBORS = 8
 _FAINT = 0.1
 """Gaussians of lower opacity link nothing, as in `lexsplat.queries.selection`."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from lexsplat.scenes.library.library import Library
 
 _COVERED = 0.3
-"""A pixel shows a thing if the thing covers this share of it."""
+"""Share of a pixel that a thing must cover to be shown by it."""
 _TOLD = 5
 """Largest number of notes, and of skipped scenes, that an answer prints."""
 

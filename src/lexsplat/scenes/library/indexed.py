@@ -282,7 +282,7 @@ def _instance(
 
 
 def _best_view(contents: Contents, part: Array) -> tuple[int, tuple[int, int, int, int]]:
-    """The image that shows most of segments, and the frame around what it shows; -1 if none does."""
+    """The image that shows most of some segments, and the frame around them in it; -1 if none shows them."""
     if not len(part):
         return -1, (0, 0, 0, 0)
     rows, points = _point_rows(contents, part)

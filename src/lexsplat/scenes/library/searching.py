@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 PROPOSED = 1000
 """Codes that a server proposes for each text."""
 _ASKED = 4
-"""Scenes that are looked at for each one that is wanted, at most."""
+"""Largest number of scenes examined for each scene of the answer."""
 _REBUILT = 2
-"""Rebuilt scenes that are looked at before the others, for each scene that is wanted."""
+"""Rebuilt scenes examined before the others, for each scene of the answer."""
 
 
 def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> Found:
@@ -77,7 +77,7 @@ def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> 
 
 
 def _in_turn(possible: Candidates, limit: int) -> list[tuple[str, float]]:
-    """The candidates in the order in which they are looked at.
+    """The candidates in the order in which they are examined.
 
     Nothing is known of rebuilt scenes. They come first, but many of them would leave no room for the others.
     """

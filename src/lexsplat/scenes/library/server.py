@@ -192,7 +192,7 @@ class Server:
             count: Number of codes for each text.
 
         Returns:
-            Their names, each once, and what no bound of the others exceeds; minus infinity if there are no others.
+            Their names, each once, and an upper limit for the bounds of the others; minus infinity if there are none.
 
         Raises:
             LibraryError: If the server fails.
