@@ -146,7 +146,7 @@ def test_a_video_becomes_a_scene_that_needs_the_video_no_more(tmp_path):
     assert next(iter(capture.views.values())).load_image().shape[2] == 3
 
 
-def test_photos_that_are_gone_are_told(tmp_path):
+def test_photos_that_are_gone_are_reported(tmp_path):
     folder = tmp_path / "photos"
     for index, camera in enumerate(room_cameras()[:5]):
         save(folder / f"{index}.png", room_photo(camera))

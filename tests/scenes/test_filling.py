@@ -121,7 +121,7 @@ def number_of_sources(fill):
         lambda fill: "fill",
     ],
 )
-def test_a_damaged_fill_is_told_in_one_line(journaled_fill, tmp_path, broken):
+def test_a_damaged_fill_is_reported_in_one_line(journaled_fill, tmp_path, broken):
     scene, header, step = journaled_fill
     journal = tmp_path / "edits.jsonl"
     journal.write_text(f"{header}\n{json.dumps({**step, 'fill': broken(step['fill'])})}\n")

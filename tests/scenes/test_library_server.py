@@ -152,7 +152,7 @@ def test_a_change_brings_to_the_server_what_it_has_missed(rooms, chroma, tmp_pat
 
 
 @pytest.mark.parametrize("lost", ["a code", "a collection"])
-def test_a_server_that_has_lost_something_is_refused_until_it_is_mended(rooms, chroma, tmp_path, lost):
+def test_a_server_that_has_lost_something_is_refused_until_it_is_repaired(rooms, chroma, tmp_path, lost):
     library = Library.create(tmp_path / "library", index=chroma.url)
     for name in NAMES:
         library.add(rooms / name)
