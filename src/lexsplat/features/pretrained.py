@@ -21,6 +21,7 @@ from torch import Tensor
 
 from lexsplat.features.hub import content_hash, preprocessing
 from lexsplat.features.weights import build_model
+from lexsplat.runtime.device import one_thread
 from lexsplat.runtime.errors import ModelError
 
 log = logging.getLogger("lexsplat")
@@ -118,9 +119,9 @@ def bfloat16_is_faster() -> bool:
         return False
     tokens, layer = torch.ones(4 * 197, 768), torch.nn.Linear(768, 3072).requires_grad_(False)
     fastest = {False: math.inf, True: math.inf}
-    for _ in range(3):
-        for half in fastest:
-            start = time.thread_time()  # other programs hardly disturb it
+    with one_thread():  # several would wait for each other beside other programs
+        for half in (False, True) * 3:
+            start = time.thread_time()
             with torch.autocast("cpu", dtype=torch.bfloat16, enabled=half):
                 layer(tokens)
             fastest[half] = min(fastest[half], time.thread_time() - start)
