@@ -53,6 +53,8 @@ class List:
             raise ValueError("give --csv or --json, not both")
         if self.output is not None and not self.images:
             raise ValueError("--output needs --images")
+        if self.output is not None and self.output.suffix.lower() != ".png":
+            raise ValueError(f"--output must be a .png file, got {self.output}")
 
     def run(self) -> None:
         """List and print."""
