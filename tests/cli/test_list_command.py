@@ -94,8 +94,10 @@ def test_an_object_of_a_scene_without_segments_is_found_by_its_word_and_the_list
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        (b"", "none"), (b"# nothing\n\n", "none"), (b"\xff\xfe\x00a", "UTF-8"), (b"mug\n\x00\x01\n", "printable characters, found '\\x00\\x01'"),
-        (b"a" * 200, "at most 120 characters, found one of 200, 'aaaaaaaaaaaaaaaaaaaa...'"), (b"word\n" * 300_000, "bytes"),
+        (b"", "none"), (b"# nothing\n\n", "none"), (b"\xff\xfe\x00a", "UTF-8"),
+        (b"mug\n\x00\x01\n", "printable characters, found '\\x00\\x01'"),
+        (b"a" * 200, "at most 120 characters, found one of 200, 'aaaaaaaaaaaaaaaaaaaa...'"),
+        (b"word\n" * 300_000, "bytes"),
         ("\n".join(map(str, range(MAX_WORDS + 1))).encode(), "2,001"),
     ],
     ids=["empty", "comments alone", "not UTF-8", "not text", "a long name", "a huge file", "too many names"],
@@ -113,7 +115,9 @@ def test_a_missing_vocabulary_and_a_folder_are_refused(tmp_path, capsys):
         fails_in_one_line(capsys, ["list", "demo", "--vocabulary", str(path)], "a readable file", found)
 
 
-@pytest.mark.parametrize("options", [["--csv", "--json"], ["--output", "a.png"], ["--images", "--output", "a.jpg"]])
+@pytest.mark.parametrize(
+    "options", [["--csv", "--json"], ["--output", "a.png"], ["--images", "--output", "a.jpg"]]
+)
 def test_options_that_contradict_each_other_are_refused(options):
     with pytest.raises(SystemExit) as stop:
         cli.main(["list", "demo", *options])

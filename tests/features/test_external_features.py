@@ -212,7 +212,9 @@ def test_segments_of_another_size_are_told_before_structure_from_motion_and_reco
     tiny_capture, segments, tmp_path, monkeypatch, change, told
 ):
     monkeypatch.setattr("lexsplat.pipeline.build.reconstruct", lambda *_, **__: pytest.fail("too late"))
-    monkeypatch.setattr("lexsplat.pipeline.inputs.poses_from_photos", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr(
+        "lexsplat.pipeline.inputs.poses_from_photos", lambda *_, **__: pytest.fail("too late")
+    )
     folder = shutil.copytree(segments, tmp_path / "segments")
     change(folder / "view_03_f.npy")
     config = BuildConfig(clip="bundled", dino="none", device="cpu", iterations=2, features_from=folder)

@@ -124,7 +124,7 @@ def build(
             SharedFolder.forget_marks(folder.root / "checkpoints")
             workers.require((capture.root,))
             return builder.run(until)
-        except (CaptureError, FileFormatError, ModelError, MemoryBudgetError):
+        except (CaptureError, FileFormatError, ModelError, MemoryBudgetError, OSError):
             if is_new:  # the lock is held, so nobody else uses the folder
                 folder.withdraw()
             raise
