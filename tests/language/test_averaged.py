@@ -279,6 +279,24 @@ def test_weights_are_the_softmax_of_the_cosines_by_hand() -> None:
     np.testing.assert_allclose(field.uncertainties.numpy(), expected, atol=1e-5)
 
 
+def test_weights_and_uncertainties_mean_the_same_in_a_wide_and_in_a_narrow_cone() -> None:
+    """Half of the Gaussians are seen as one thing, the others as two in turn; all features share a direction."""
+    rng = np.random.default_rng(0)
+    first, second = rng.integers(0, 40, 1000), rng.integers(0, 40, 1000)
+    second[::2] = first[::2]
+    fields = []
+    for shared in (0.0, 0.5, 0.73):  # mean cosine of two features
+        things = np.hstack([np.full((40, 1), shared**0.5), (1 - shared) ** 0.5 * np.eye(40)])
+        means = (things[first] + things[second]) / 2
+        found = MeanFeatures(means.astype(np.float16), torch.full((1000,), 100.0))
+        fields.append(field_from_means(found, replace(CODES, num_codes=40), AveragedConfig(), seed=0))
+    differ = first != second
+    for field in fields:
+        assert (field.uncertainties[~differ] < 0.01).all()
+        assert 0.5 < float(field.uncertainties[differ].mean()) < 0.7  # 1 - |F| is 0.29 to 0.07
+        assert float(field.weights[:, 0].mean()) == pytest.approx(0.93, abs=0.04)
+
+
 def test_averages_are_bit_identical_on_any_number_of_threads() -> None:
     gaussians, camera = random_gaussians(20_000, 0, scale=0.02), front_camera(160, 120)
     maps = random_features({"a": camera}, dimensions=70)
