@@ -230,6 +230,7 @@ def _registered_images(
     facts = {
         "registered": len(found.registered),
         "unregistered": list(found.unregistered),
+        "mapper": found.mapper,
         "images": images,
     }
     folder.finish("poses", key, time.perf_counter() - start, **facts)
