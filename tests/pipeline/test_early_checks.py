@@ -43,10 +43,10 @@ def photos(tmp_path, monkeypatch) -> Path:
 
 def refused(source: Path, output: Path, *parts: str, kind=CaptureError, config=CONFIG, **options) -> None:
     with pytest.raises(kind) as caught:
-        build(source, output, config, **options)
+        build(source, output / "new" / "scene", config, **options)
     assert isinstance(caught.value, LexsplatError)
     assert_tells(caught.value, *parts)
-    assert not output.exists(), "nothing half-written"
+    assert not output.exists(), "nothing half-written, and no empty folder"
 
 
 def test_ground_truth_is_checked_before_structure_from_motion(photos, tmp_path):

@@ -93,6 +93,7 @@ def build(
     folder = SceneFolder(Path(output))
     folder.refuse_foreign_files()
     is_new = not folder.root.exists()
+    above = [place for place in folder.root.absolute().parents if not place.exists()]
     given = (source,) if source is not None and source.is_dir() else ()  # of a video workers get the frames
     with open_workers(config.workers, given) as workers, folder.locked(), warnings_once():
         try:
@@ -126,7 +127,7 @@ def build(
             return builder.run(until)
         except (CaptureError, FileFormatError, ModelError, MemoryBudgetError, OSError):
             if is_new:  # the lock is held, so nobody else uses the folder
-                folder.withdraw()
+                folder.withdraw(above)
             raise
 
 
