@@ -15,13 +15,13 @@ from torch.nn.functional import normalize
 from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureMap, FeatureMaps
 from lexsplat.language.fields import CodeField
-from lexsplat.language.methods import METHODS
+from lexsplat.language.methods import METHODS, averaging
 from lexsplat.language.methods.averaged import (
     AveragedConfig,
     features_of_codes,
     field_from_means,
 )
-from lexsplat.language.methods.averaging import MeanFeatures, average_features
+from lexsplat.language.methods.averaging import MeanFeatures, average_features, sums_bound
 from lexsplat.language.methods.method import FitRun, TrainingViews
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.queries.visibility import hidden_gaussians
@@ -30,6 +30,7 @@ from lexsplat.runtime.memory import parse_bytes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
+CPU = torch.device("cpu")
 CODES = CodebookConfig(num_codes=5, use_dino=False)
 FULL_SIZE = AveragedConfig(shortest_side=10_000)
 
@@ -162,6 +163,18 @@ def test_less_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_pat
     np.testing.assert_allclose(np.asarray(found.means, float), np.asarray(whole.means, float), atol=1e-3)
     assert (received[-1].done, received[-1].total) == ({1: 21, 30 * 8 * 3: 9, 30 * 8 * 4: 6}[memory],) * 2
     assert list((tmp_path).rglob("*.*")) == []  # the file of the means has no name
+
+
+def test_sums_on_a_gpu_are_bounded_by_its_free_memory_and_not_by_the_host(monkeypatch) -> None:
+    gpu, free = torch.device("cuda", 0), 24 << 30
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 2 * free))
+    assert sums_bound(gpu, 4 << 30) == free // 2
+    passes = [len(list(averaging._ranges(512, 3_000_000, sums_bound(d, 4 << 30)))) for d in (gpu, CPU)]
+    assert passes == [1, 12]
+    assert sums_bound(CPU, 2 << 30) == 1 << 29
+    assert sums_bound(CPU, 64 << 30) == averaging.MAX_STORE
+    free = 1 << 30
+    assert sums_bound(gpu, 4 << 30) == 1 << 29
 
 
 @pytest.mark.parametrize("memory", ["4GB", "100B"])
