@@ -3,6 +3,8 @@
 import csv
 import io
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -89,6 +91,16 @@ def test_an_object_of_a_scene_without_segments_is_found_by_its_word_and_the_list
     assert "lexsplat language CAPTURE --output SCENE" in document["note"], "how to get them"
     validated("list", document)
     assert {"mug", "pumpkin", "teddy bear"} <= {thing["name"] for thing in document["objects"]}
+
+
+def test_a_table_is_alone_on_standard_output_and_the_rest_is_told_beside_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("lexsplat.scenes.objects.NO_SEGMENTS", "how to get them")
+    old = Path(__file__).parents[1] / "data" / "scene_d4e65b3" / "averaged"
+    scene, sheet = str(shutil.copytree(old, tmp_path / "scene")), str(tmp_path / "sheet.png")
+    assert cli.main(["list", scene, "--csv", "--images", "--output", sheet]) == 0
+    found = capsys.readouterr()
+    assert {len(row) for row in csv.reader(io.StringIO(found.out))} == {14}
+    assert found.err.splitlines()[-2:] == ["no segments: each word is looked for; how to get them", sheet]
 
 
 @pytest.mark.parametrize(

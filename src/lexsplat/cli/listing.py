@@ -68,6 +68,8 @@ class List:
             print_json(document)
         elif self.csv:
             _print_table(document["objects"])
+            for line in filter(None, (document["note"], document["picture"])):
+                print(line, file=sys.stderr)  # standard output is the table
         else:
             _print_objects(document)
 
