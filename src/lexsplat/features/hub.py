@@ -11,6 +11,7 @@ import logging
 import os
 import shutil
 from collections.abc import Collection, Iterator
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,9 @@ def model_folder(name: str, tower: str) -> Path:
         is_model = (folder.parent / "config.json").is_file()
         remedy = f"give its folder: --{tower} {folder.parent}" if is_model else _choices(tower)
         raise ModelError(name, expected="a model folder", found="a file", remedy=remedy)
+    if "/" not in name and get_close_matches(name.lower(), ("bundled", "embedded")):
+        expected, remedy = "a model folder, or a name OWNER/NAME", f"use `--{tower} bundled`"
+        raise ModelError(name, expected=expected, found="no such folder", remedy=remedy)
     if len(folder.parts) > 2 or name.startswith((".", "~")):  # names on the hub are OWNER/NAME
         expected = "a model folder, or a name OWNER/NAME"
         raise ModelError(name, expected=expected, found="no such folder", remedy=_choices(tower))
