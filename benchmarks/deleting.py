@@ -90,24 +90,24 @@ def measured(
     after = resource.getrusage(resource.RUSAGE_SELF)
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     fill = filled.steps[-1].values.get("fill", {"gaussians": 0})
-    truths = {name: truth for name, (truth, _) in views.items()}
-    truly = with_true_colors(filled.scene, fill["gaussians"], truths)
+    originals = {name: original for name, (original, _) in views.items()}
+    truly = with_true_colors(filled.scene, fill["gaussians"], originals)
     scenes = {"without fill": bare.scene, "with fill": filled.scene, "true colors": truly}
     errors: dict[str, list[Array]] = {name: [] for name in ("unedited", *scenes)}
     left: dict[str, list[Array]] = {name: [] for name in ("without fill", "with fill")}
     rows = []
-    for name, (truth, mask) in views.items():
-        unedited = _rendered(scene, name, truth)
-        pictures = {key: _rendered(each, name, truth) for key, each in scenes.items()}
-        errors["unedited"].append(((unedited - truth)[~mask] ** 2).ravel())
+    for name, (original, mask) in views.items():
+        unedited = _rendered(scene, name, original)
+        pictures = {key: _rendered(each, name, original) for key, each in scenes.items()}
+        errors["unedited"].append(((unedited - original)[~mask] ** 2).ravel())
         for key, picture in pictures.items():
-            errors[key].append(((picture - truth)[mask] ** 2).ravel())
+            errors[key].append(((picture - original)[mask] ** 2).ravel())
             if key in left:
-                left[key].append(of_its_color(picture, truth, unedited, mask)[mask])
+                left[key].append(of_its_color(picture, original, unedited, mask)[mask])
         (top, bottom), (start, end) = (
             (max(i.min() - _MARGIN, 0), i.max() + _MARGIN) for i in np.nonzero(mask)
         )
-        rows.append([each[top:bottom, start:end] for each in (unedited, truth, *pictures.values())])
+        rows.append([each[top:bottom, start:end] for each in (unedited, original, *pictures.values())])
     numbers = {
         f"{key}, dB": round(-10 * float(np.log10(np.concatenate(each).mean())), 2)
         for key, each in errors.items()
@@ -119,12 +119,14 @@ def measured(
     return {**numbers, **shares, **counts, "delete, processor seconds": round(seconds, 2)}, _sheet(rows)
 
 
-def of_its_color(picture: Array, truth: Array, unedited: Array, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels ``[H, W]`` in the hue of a thing where the truth has another one.
+def of_its_color(
+    picture: Array, original: Array, unedited: Array, mask: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Pixels ``[H, W]`` in the hue of a thing where the original has another one.
 
     The hue is the median of the more colorful half of the thing's pixels.
     """
-    own, here, there = (rgb2lab(each)[..., 1:] for each in (unedited, picture, truth))
+    own, here, there = (rgb2lab(each)[..., 1:] for each in (unedited, picture, original))
     chroma = np.linalg.norm(own[mask], axis=1)
     hue = np.median(own[mask][chroma >= np.median(chroma)], 0)
     reach = min(_HUE, float(np.linalg.norm(hue)) / 2)  # a pale color must not reach gray
@@ -132,7 +134,7 @@ def of_its_color(picture: Array, truth: Array, unedited: Array, mask: NDArray[np
     return np.asarray(like & ~should)
 
 
-def with_true_colors(filled: Scene, count: int, truths: dict[str, Array]) -> Scene:
+def with_true_colors(filled: Scene, count: int, originals: dict[str, Array]) -> Scene:
     """A scene whose last ``count`` Gaussians, the fill, have the colors of renderings.
 
     Each takes the mean of the views in which nothing is before it; those that no view shows keep theirs.
@@ -140,14 +142,14 @@ def with_true_colors(filled: Scene, count: int, truths: dict[str, Array]) -> Sce
     gaussians = filled.gaussians
     centers = gaussians.means[len(gaussians) - count :].double().numpy()
     total, seen = np.zeros((count, 3)), np.zeros(count)
-    for name, truth in truths.items():
-        camera = _camera(filled, name, truth)
+    for name, original in originals.items():
+        camera = _camera(filled, name, original)
         depths = render(gaussians, camera, depth=True).depth
         assert depths is not None
         x, y, depth = ((centers @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T).T
         places = np.stack([y / depth - 0.5, x / depth - 0.5])
         open_to = map_coordinates(depths.double().numpy(), places, order=1) > 0.97 * depth
-        colors = [map_coordinates(channel, places, order=1) for channel in np.moveaxis(truth, -1, 0)]
+        colors = [map_coordinates(channel, places, order=1) for channel in np.moveaxis(original, -1, 0)]
         total += np.stack(colors, 1) * open_to[:, None]
         seen += open_to
     sh0 = gaussians.sh0.clone()
@@ -157,13 +159,13 @@ def with_true_colors(filled: Scene, count: int, truths: dict[str, Array]) -> Sce
     return filled.with_content(replace(gaussians, sh0=sh0), filled.field)
 
 
-def _rendered(scene: Scene, name: str, truth: Array) -> Array:
+def _rendered(scene: Scene, name: str, original: Array) -> Array:
     """A view in the size of its rendering."""
-    return scene.render(_camera(scene, name, truth)).image.cpu().double().numpy().clip(0, 1)
+    return scene.render(_camera(scene, name, original)).image.cpu().double().numpy().clip(0, 1)
 
 
-def _camera(scene: Scene, name: str, truth: Array) -> Camera:
-    return scene.camera(name).resized(truth.shape[1], truth.shape[0])
+def _camera(scene: Scene, name: str, original: Array) -> Camera:
+    return scene.camera(name).resized(original.shape[1], original.shape[0])
 
 
 def _read(path: Path) -> Array:

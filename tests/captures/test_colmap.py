@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pycolmap
 import pytest
-from support.refusals import assert_tells, fails
+from support.refusals import assert_reports, fails
 from support.written_captures import (
     HEIGHT,
     WIDTH,
@@ -152,7 +152,7 @@ def test_a_binary_file_truncated_anywhere_is_refused(tmp_path, file):
         (model / file).write_bytes(whole[:size])
         with pytest.raises(FileFormatError) as caught:
             load_capture(tmp_path)
-        assert_tells(caught.value, file)
+        assert_reports(caught.value, file)
     (model / file).write_bytes(whole + b"\0")
     fails(tmp_path, file, "1 more bytes", kind=FileFormatError)
 
@@ -264,7 +264,7 @@ def test_mutated_models_yield_a_capture_or_a_typed_error(tmp_path, suffix):
             capture = load_capture(tmp_path)
         except LexsplatError as error:
             failed += 1
-            assert_tells(error)
+            assert_reports(error)
         else:
             assert np.isfinite(capture.points).all()
             for view in capture.views.values():

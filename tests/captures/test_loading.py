@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
-from support.refusals import assert_tells, fails
+from support.refusals import assert_reports, fails
 from support.written_captures import (
     FOCAL,
     HEIGHT,
@@ -271,7 +271,7 @@ class TestImages:
         path.write_bytes(whole[: len(whole) // 2])
         with pytest.raises(CaptureError) as caught:
             view.load_image()
-        assert_tells(caught.value, str(path))
+        assert_reports(caught.value, str(path))
 
     def test_a_photo_that_changed_or_vanished_after_loading_is_reported(self, tmp_path):
         path = self.one(tmp_path)
@@ -279,11 +279,11 @@ class TestImages:
         save(path, np.zeros((10, 10, 3)))
         with pytest.raises(CaptureError) as caught:
             view.load_image()
-        assert_tells(caught.value, str(path), "64x48", "10x10")
+        assert_reports(caught.value, str(path), "64x48", "10x10")
         path.unlink()
         with pytest.raises(CaptureError) as caught:
             view.load_image()
-        assert_tells(caught.value, str(path), "no such file")
+        assert_reports(caught.value, str(path), "no such file")
 
     def test_a_decompression_bomb_is_refused(self, tmp_path, monkeypatch):
         path = self.one(tmp_path)
@@ -419,13 +419,13 @@ class TestMasks:
         save(tmp_path / "segmentations" / "0001" / "x.png", np.ones((48, 64)))
         with pytest.raises(CaptureError) as caught:
             load_annotations(load_capture(tmp_path))
-        assert_tells(caught.value, "2 views")
+        assert_reports(caught.value, "2 views")
 
     def test_a_mask_whose_stem_matches_no_view_is_reported(self, tmp_path):
         capture = load_capture(self.capture(tmp_path, NAMES, **{"0004": (64, 48), "0099": (64, 48)}))
         with pytest.raises(CaptureError) as caught:
             load_annotations(capture)
-        assert_tells(caught.value, str(tmp_path / "segmentations" / "0099"), "no view")
+        assert_reports(caught.value, str(tmp_path / "segmentations" / "0099"), "no view")
 
     def test_a_mask_of_another_aspect_is_refused_and_a_scaled_one_accepted(self, tmp_path):
         capture = load_capture(self.capture(tmp_path, NAMES, **{"0004": (32, 24)}))
@@ -433,7 +433,7 @@ class TestMasks:
         save(tmp_path / "segmentations" / "0004" / "bad.png", np.ones((48, 48)))
         with pytest.raises(CaptureError) as caught:
             load_annotations(capture)
-        assert_tells(caught.value, "bad.png", "64x48", "48x48")
+        assert_reports(caught.value, "bad.png", "64x48", "48x48")
 
     @pytest.mark.parametrize(("high", "dtype"), [(1, np.uint8), (255, np.uint8), (65535, np.uint16)])
     def test_masks_of_any_depth(self, tmp_path, high, dtype):

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 from PIL import Image, ImageOps
 from support.poses import move
-from support.refusals import assert_tells, fails
+from support.refusals import assert_reports, fails
 from support.rooms import (
     COUNT,
     SIZE,
@@ -86,7 +86,7 @@ def test_folders_that_are_not_captures_are_refused(tmp_path):
     for folder, found in ((tmp_path / "nowhere", "no such folder"), (tmp_path, "found 0")):
         with pytest.raises(CaptureError) as caught:
             poses_from_photos(folder, tmp_path / "out")
-        assert_tells(caught.value, str(folder), found)
+        assert_reports(caught.value, str(folder), found)
 
 
 def test_photos_that_do_not_overlap_leave_no_output(tmp_path):
@@ -94,12 +94,12 @@ def test_photos_that_do_not_overlap_leave_no_output(tmp_path):
         save(tmp_path / "photos" / f"{index}.png", np.full((60, 80, 3), 0.3 * index))
     with pytest.raises(CaptureError) as caught:
         poses_from_photos(tmp_path / "photos", tmp_path / "out")
-    assert_tells(caught.value, "3 photos, none of which")
+    assert_reports(caught.value, "3 photos, none of which")
     assert not (tmp_path / "out").exists()
     (tmp_path / "photos" / "1.png").write_bytes(b"no image")
     with pytest.raises(CaptureError) as caught:
         poses_from_photos(tmp_path / "photos", tmp_path / "out")
-    assert_tells(caught.value, "1.png")
+    assert_reports(caught.value, "1.png")
     fails(tmp_path / "photos", "lexsplat poses")
 
 
@@ -278,10 +278,10 @@ def test_a_mask_of_another_aspect_is_refused_before_any_work(tmp_path):
     save(tmp_path / "photos" / "masks" / "1.png", np.ones((60, 40)))
     with pytest.raises(CaptureError) as caught:
         poses_from_photos(tmp_path / "photos", tmp_path / "out")
-    assert_tells(caught.value, "1.png", "60x40", "40x60")
+    assert_reports(caught.value, "1.png", "60x40", "40x60")
     with pytest.raises(CaptureError) as caught:
         poses_from_photos(tmp_path / "photos", tmp_path / "photos")
-    assert_tells(caught.value, "--output")
+    assert_reports(caught.value, "--output")
 
 
 def three_photos(folder, suffix: str = ".jpg") -> None:
@@ -296,7 +296,7 @@ def test_a_truncated_photo_is_refused_before_any_work(tmp_path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(CaptureError) as caught:
         prepare_photos(tmp_path / "photos", tmp_path / "output")
-    assert_tells(caught.value, "1.jpg", "damaged", "truncated")
+    assert_reports(caught.value, "1.jpg", "damaged", "truncated")
     assert not (tmp_path / "output").exists()
 
 
@@ -308,7 +308,7 @@ def test_names_that_camera_files_cannot_hold_are_refused_before_any_work(tmp_pat
     shutil.copy(tmp_path / "photos" / "0.jpg", path)
     with pytest.raises(CaptureError) as caught:
         prepare_photos(tmp_path / "photos", tmp_path / "output")
-    assert_tells(caught.value, "photos", "rename")
+    assert_reports(caught.value, "photos", "rename")
     str(caught.value).encode("utf-8")
 
 

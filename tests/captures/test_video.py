@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
-from support.refusals import assert_tells
+from support.refusals import assert_reports
 
 from lexsplat.captures.readers.video import (
     FrameMeasures,
@@ -139,7 +139,7 @@ def test_truncated_videos_are_refused(tmp_path, share, faststart):
     path.write_bytes(whole[: int(len(whole) * share)])
     with pytest.raises(CaptureError) as caught:
         sample_video(path, tmp_path / "out", 5)
-    assert_tells(caught.value, "cut.mp4")
+    assert_reports(caught.value, "cut.mp4")
     assert not list(tmp_path.rglob("frame_*"))
 
 
@@ -148,7 +148,7 @@ def test_files_that_are_not_videos_are_refused(tmp_path):
     for name, found in (("words.mp4", "damaged"), ("nowhere.mov", "no such file")):
         with pytest.raises(CaptureError) as caught:
             sample_video(tmp_path / name, tmp_path / "out", 5)
-        assert_tells(caught.value, name, found)
+        assert_reports(caught.value, name, found)
     assert is_video(Path("A.MOV"))
     assert not is_video(tmp_path)
     with pytest.raises(ValueError, match="count"):
@@ -166,4 +166,4 @@ def test_without_the_library_the_error_names_the_extra(video, tmp_path, monkeypa
     monkeypatch.setattr(builtins, "__import__", without_av)
     with pytest.raises(BackendError) as caught:
         sample_video(video, tmp_path, 5)
-    assert_tells(caught.value, "lexsplat[video]")
+    assert_reports(caught.value, "lexsplat[video]")

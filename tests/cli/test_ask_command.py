@@ -45,7 +45,7 @@ def test_a_question_on_the_command_line_is_answered_with_a_sentence(capsys):
 
 
 @pytest.mark.parametrize("arguments", [["ask", "demo"], ["ask", "demo", "mug", "--stdin"], ["mcp"]])
-def test_wrong_usage_is_told(arguments):
+def test_wrong_usage_is_reported(arguments):
     with pytest.raises(SystemExit) as stop:
         cli.main(arguments)
     assert stop.value.code == 2

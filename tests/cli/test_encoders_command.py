@@ -87,7 +87,7 @@ def test_the_estimate_counts_the_crops_that_extraction_encodes(tiny_capture, tmp
     assert estimate(clip, None, config, size).crops == count_crops(config, size)
 
 
-def test_times_are_told_in_their_unit():
+def test_times_are_reported_in_their_unit():
     assert (
         Estimate(141, 12.3).describe(10)
         == "141 crops and about 12.3 s a photo; 2:03 min for 10 training photos"

@@ -81,7 +81,7 @@ def test_without_thumbnails_a_search_writes_nothing(rooms, capsys):
     assert {path: path.stat().st_mtime_ns for path in (rooms / "library").rglob("*")} == before
 
 
-def test_what_is_wrong_is_told_in_one_line_with_its_remedy(rooms, capsys):
+def test_what_is_wrong_is_reported_in_one_line_with_its_remedy(rooms, capsys):
     library = str(rooms / "library")
     fails_in_one_line(
         capsys, ["library", "search", str(rooms), "mug"], "library.json", "lexsplat library add"
@@ -134,7 +134,7 @@ def test_an_answer_is_given_where_its_thumbnails_cannot_be_written(rooms, capsys
 
 
 @pytest.mark.parametrize("text", [None, "{"])
-def test_a_lost_library_file_is_mended_by_verify(rooms, capsys, text):
+def test_a_lost_library_file_is_repaired_by_verify(rooms, capsys, text):
     path = rooms / "library" / "library.json"
     path.unlink() if text is None else path.write_text(text)
     fails_in_one_line(capsys, ["library", "search", str(rooms / "library"), "mug"], "verify", "--repair")

@@ -114,7 +114,7 @@ def test_the_report_shows_every_method_and_loads_nothing(compared):
     assert len(cases) == sum(row["views"] for row in prompts.values())
     for case in cases:
         assert case.count('class="answer"') == len(names), "one column for each method"
-        assert case.count("<img") == 1 + 2 * len(names), "truth once; heatmap and mask of each method"
+        assert case.count("<img") == 1 + 2 * len(names), "ground truth once; heatmap and mask of each method"
     means = [sum(map(float, re.findall(r"IoU ([0-9.]+)", case))) for case in cases]
     assert means == sorted(means), "worst first"
     assert text.count("<polyline") == len(names) * (1 + len(prompts))

@@ -226,7 +226,7 @@ def test_observers_see_every_view_once(capture, gaussians):
         assert set(pictures.relevancy) == set(pictures.ground_truth) == set(pictures.thresholds) == set(WORDS)
 
 
-def test_progress_is_told(capture, gaussians):
+def test_progress_is_reported(capture, gaussians):
     events = []
     evaluate(capture, traced(capture, gaussians), QUICK, ground_truth=GroundTruth({}), listener=events.append)
     assert [(event.stage, event.done, event.total) for event in events] == [

@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 from support.noise_photos import HEIGHT, WIDTH, make_capture
-from support.refusals import assert_tells
+from support.refusals import assert_reports
 from support.tiny_capture import SPHERES, camera_poses, trace
 
 from lexsplat import cli
@@ -208,7 +208,7 @@ def replaced(array: np.ndarray, ending: str = "_s.npy"):
     ],
     ids=["none", "another aspect", "a row", "no level", "no segment", "words"],
 )
-def test_segments_of_another_size_are_told_before_structure_from_motion_and_reconstruction(
+def test_segments_of_another_size_are_reported_before_structure_from_motion_and_reconstruction(
     tiny_capture, segments, tmp_path, monkeypatch, change, told
 ):
     monkeypatch.setattr("lexsplat.pipeline.build.reconstruct", lambda *_, **__: pytest.fail("too late"))
@@ -221,7 +221,7 @@ def test_segments_of_another_size_are_told_before_structure_from_motion_and_reco
     for source in (tiny_capture, tiny_capture / "images"):
         with pytest.raises(FileFormatError) as caught:
             build(source, tmp_path / "scene", config)
-        assert_tells(caught.value, *told)
+        assert_reports(caught.value, *told)
         assert not (tmp_path / "scene").exists(), "nothing half-written"
 
 
@@ -241,7 +241,7 @@ def test_segments_with_wrong_numbers_are_refused_with_what_to_do(
     np.save(folder / "view_03_s.npy", numbers)
     with pytest.raises(FileFormatError) as caught:
         load_external_features(folder, load_capture(tiny_capture))["view_03.png"]
-    assert_tells(caught.value, "view_03_s.npy", told)
+    assert_reports(caught.value, "view_03_s.npy", told)
 
 
 def test_a_view_without_an_array_is_reported_before_anything_is_written(

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import huggingface_hub
 import pytest
 from huggingface_hub import constants, errors
-from support.refusals import assert_tells
+from support.refusals import assert_reports
 
 from lexsplat.features import hub
 from lexsplat.features.encoders import DEFAULT_CLIP, load_clip, load_dino
@@ -80,7 +80,7 @@ def hub_error(kind, status: int):
 def refused(*parts: str, name: str = "someone/model", load=load_clip) -> None:
     with pytest.raises(ModelError) as caught:
         load(name)
-    assert_tells(caught.value, *parts)
+    assert_reports(caught.value, *parts)
 
 
 def test_the_first_weights_that_exist_are_fetched_with_what_belongs_to_them(fake):
@@ -108,7 +108,7 @@ def test_the_first_weights_that_exist_are_fetched_with_what_belongs_to_them(fake
     ]
 
 
-def test_license_and_size_are_told_before_the_download(fake, caplog):
+def test_license_and_size_are_reported_before_the_download(fake, caplog):
     fake.late_error = ConnectionError("gone")
     with caplog.at_level(NOTE, logger="lexsplat"):
         refused("internet")
@@ -192,7 +192,7 @@ def test_each_cause_has_its_own_message(fake):
     refused("cache", "a full disk", "HF_HOME")
 
 
-def test_a_disk_without_enough_space_is_told_before_the_download(fake, monkeypatch):
+def test_a_disk_without_enough_space_is_reported_before_the_download(fake, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=10_000_000))
     refused("600 MB of free space", "found 10 MB", "HF_HOME")
     assert not fake.fetched

@@ -12,7 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 from support.encoder_folders import in_open_clip_names, in_timm_names, save_model, seeded, tiny_vit
-from support.refusals import assert_tells
+from support.refusals import assert_reports
 from support.siglip_folder import siglip_folder
 
 from lexsplat.features import hub
@@ -46,7 +46,7 @@ def rewrite(folder: Path, change, name: str = "model.safetensors") -> None:
 def refused(folder: Path, *parts: str, load=load_clip) -> None:
     with pytest.raises(ModelError) as caught:
         load(str(folder))
-    assert_tells(caught.value, *parts)
+    assert_reports(caught.value, *parts)
 
 
 def assert_same_model(found, folder: Path) -> None:
@@ -251,7 +251,7 @@ def test_weights_that_are_not_finite_are_refused(clip_copy, vit_folder, tmp_path
     encoder = load_clip(str(clip_copy))
     with pytest.raises(ModelError) as caught:
         encoder.encode_images(torch.rand(1, 3, 40, 40))
-    assert_tells(caught.value, "finite features")
+    assert_reports(caught.value, "finite features")
     folder = shutil.copytree(vit_folder, tmp_path / "vit")
     rewrite(folder, lambda state: {name: tensor * torch.inf for name, tensor in state.items()})
     with pytest.raises(ModelError, match="finite features"):
@@ -298,7 +298,7 @@ def test_a_damaged_folder_is_refused(clip_copy, content):
         refused(clip_copy, "an empty folder")
 
 
-def test_a_clone_without_its_large_files_is_told(clip_copy):
+def test_a_clone_without_its_large_files_is_reported(clip_copy):
     pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 598641023\n"
     (clip_copy / "model.safetensors").write_text(pointer)
     refused(clip_copy, "model.safetensors", "a pointer of Git LFS", f"git -C {clip_copy} lfs pull")

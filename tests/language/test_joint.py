@@ -1,4 +1,4 @@
-"""Language beside geometry from the first step: geometry hears nothing of it, language follows density control."""
+"""Language beside geometry from the first step: geometry receives nothing of it, language follows density control."""
 
 from __future__ import annotations
 

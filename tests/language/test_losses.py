@@ -11,7 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lexsplat.language.losses import cross_entropy_loss, smoothing_loss, uncertainty_loss
+from lexsplat.language import losses
+from lexsplat.language.losses import cross_entropy_loss, mean_in_blocks, smoothing_loss, uncertainty_loss
 
 
 def numeric_gradient(function: Callable[[np.ndarray], float], at: np.ndarray) -> np.ndarray:
@@ -173,3 +174,23 @@ def test_bad_arguments_are_refused() -> None:
         uncertainty_loss(torch.zeros(1), "cubic")
     with pytest.raises(ValueError, match="max"):
         smoothing_loss(torch.zeros(1, 8), torch.zeros(1, 8), torch.zeros(1), weight="min")
+
+
+@pytest.mark.parametrize("count", [7, 8, 21])
+def test_a_mean_in_blocks_has_the_value_and_the_gradients_of_the_whole(monkeypatch, count):
+    monkeypatch.setitem(losses._BLOCK, "cpu", 8)
+    rng = torch.Generator().manual_seed(0)
+    decoder = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.ReLU(), torch.nn.Linear(4, 5)).double()
+    given = torch.randn(count, 3, generator=rng, dtype=torch.float64)
+    codes = torch.randint(5, (count,), generator=rng)
+    uncertain = torch.rand(count, generator=rng, dtype=torch.float64)
+
+    def found(mean) -> tuple[torch.Tensor, ...]:
+        x, u = given.clone().requires_grad_(), uncertain.clone().requires_grad_()
+        parameters = list(decoder.parameters())
+        value = mean(lambda *rows: cross_entropy_loss(decoder(rows[0]), *rows[1:]), (x, codes, u), parameters)
+        return (value.detach(), *torch.autograd.grad(3 * value + u.sum(), [x, u, *parameters]))
+
+    whole = found(lambda loss, rows, parameters: loss(*rows))
+    for one, other in zip(found(mean_in_blocks), whole, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)

@@ -48,7 +48,7 @@ def test_the_search_of_a_library_has_the_keys_of_the_command(server):
         assert set(part["required"]) == set(described[name]["required"])
 
 
-def test_a_search_tells_what_it_did_not_understand_or_mended(server):
+def test_a_search_reports_what_it_did_not_understand_or_corrected(server):
     reply, text = ask(server, "search_library", phrase="why is the sky blue")
     document = reply.structured_content
     validated("library", {"library": "x", "phrases": [document]})

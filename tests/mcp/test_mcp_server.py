@@ -164,7 +164,7 @@ def test_a_dialogue_of_more_than_twenty_questions_is_answered_rightly(server):
         ("edit", {"action": "keep", "phrase": "🍎", "folder": "apple", "confirm": True}),
     ],
 )
-def test_every_answer_tells_what_is_unsure_and_why(scenes, tmp_path, tool, arguments):
+def test_every_answer_reports_what_is_unsure_and_why(scenes, tmp_path, tool, arguments):
     reply, text = ask(make_server(scenes, tmp_path), tool, **arguments)
     asked = reply.structured_content["look_at"] if tool == "render" else reply.structured_content
     assert asked["present"] == "unsure"
@@ -175,7 +175,9 @@ def test_every_answer_tells_what_is_unsure_and_why(scenes, tmp_path, tool, argum
     assert asked["understood"] in text or tool == "nearest"
 
 
-def test_an_edit_of_what_is_unsure_or_not_here_is_refused_and_one_of_a_mended_word_tells_it(scenes, tmp_path):
+def test_an_edit_of_what_is_unsure_or_not_here_is_refused_and_one_of_a_corrected_word_reports_it(
+    scenes, tmp_path
+):
     server = make_server(scenes, tmp_path)
     for phrase, told in (("🍎", "confirm=true"), ("unicorn", "not here")):
         reply, text = ask(server, "edit", action="delete", phrase=phrase, folder="without")

@@ -64,7 +64,7 @@ def test_features_of_workers_are_those_of_one_process(visible, capture, tmp_path
     assert len(events) == 12, "nothing is missing any more"
 
 
-def test_a_broken_photo_is_told_and_the_other_views_are_kept(capture, tmp_path):
+def test_a_broken_photo_is_reported_and_the_other_views_are_kept(capture, tmp_path):
     broken = capture.views["view_03.png"].image_path
     broken.write_bytes(broken.read_bytes()[:2000])
     with pytest.raises(CaptureError, match=r"view_03\.png"):
@@ -72,7 +72,7 @@ def test_a_broken_photo_is_told_and_the_other_views_are_kept(capture, tmp_path):
     assert len(files(tmp_path / "cache")) == 22, "two files for each of eleven views"
 
 
-def test_a_photo_that_a_worker_does_not_see_is_told_with_the_remedy(capture, tmp_path):
+def test_a_photo_that_a_worker_does_not_see_is_reported_with_the_remedy(capture, tmp_path):
     capture.views["view_05.png"].image_path.unlink()
     view = capture.views["view_05.png"]
     with SharedFolder.offered(tmp_path / "cache") as cache:
@@ -199,7 +199,9 @@ def test_folders_of_settings_get_full_paths(tmp_path, monkeypatch):
     assert found.features_from == tmp_path / "features"
 
 
-def test_a_cluster_that_is_not_there_is_told_before_anything_is_written(tiny_capture, tmp_path, monkeypatch):
+def test_a_cluster_that_is_not_there_is_reported_before_anything_is_written(
+    tiny_capture, tmp_path, monkeypatch
+):
     def refuse(*_):
         raise WorkersError("Ray at head:1", expected="a running cluster")
 
@@ -294,7 +296,7 @@ def test_events_and_warnings_of_scenes_carry_their_names(workers, tmp_path, monk
 
 
 @pytest.mark.slow
-def test_many_captures_make_many_scenes_and_one_that_fails_is_told(tiny_capture, tmp_path, capsys):
+def test_many_captures_make_many_scenes_and_one_that_fails_is_reported(tiny_capture, tmp_path, capsys):
     for name in ("bath", "kitchen"):
         shutil.copytree(tiny_capture, tmp_path / "captures" / name)
     (tmp_path / "captures" / "attic").mkdir()

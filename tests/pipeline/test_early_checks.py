@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import color_encoder
-from support.refusals import assert_tells
+from support.refusals import assert_reports
 from support.written_captures import save
 
 from lexsplat.captures import load_capture
@@ -45,7 +45,7 @@ def refused(source: Path, output: Path, *parts: str, kind=CaptureError, config=C
     with pytest.raises(kind) as caught:
         build(source, output / "new" / "scene", config, **options)
     assert isinstance(caught.value, LexsplatError)
-    assert_tells(caught.value, *parts)
+    assert_reports(caught.value, *parts)
     assert not output.exists(), "nothing half-written, and no empty folder"
 
 
@@ -61,7 +61,7 @@ def test_ground_truth_is_checked_before_structure_from_motion(photos, tmp_path):
     ("files", "told"),
     [(None, "no such folder"), ([], "an empty folder"), (["0.png", "1.png"], "at least 3 photos")],
 )
-def test_a_missing_capture_is_told_before_an_encoder_is_fetched(files, told, tmp_path, monkeypatch):
+def test_a_missing_capture_is_reported_before_an_encoder_is_fetched(files, told, tmp_path, monkeypatch):
     source = tmp_path / "capture"
     if files is not None:
         source.mkdir()
@@ -75,7 +75,7 @@ def test_held_out_names_are_checked_before_structure_from_motion(photos, tmp_pat
     refused(photos, tmp_path / "out", "'7'", "matches no view", test_names=["7"])
 
 
-def test_a_photo_that_is_none_is_told_before_structure_from_motion(photos, tmp_path):
+def test_a_photo_that_is_none_is_reported_before_structure_from_motion(photos, tmp_path):
     (photos / "images" / "3.png").write_text("no image")
     refused(photos, tmp_path / "out", "3.png")
 
@@ -120,7 +120,7 @@ def test_splats_of_another_place_are_refused_and_those_of_the_place_taken(tmp_pa
     refused(demo_capture("second"), tmp_path / "other", "gaussians.ply", "correlate", **options)
 
 
-def test_a_gpu_without_a_compiler_is_told_before_anything_is_written(photos, tmp_path, monkeypatch):
+def test_a_gpu_without_a_compiler_is_reported_before_anything_is_written(photos, tmp_path, monkeypatch):
     def without_extension():
         raise BackendError("gsplat", expected="its extension", found="none", remedy="use --device cpu")
 
@@ -129,7 +129,9 @@ def test_a_gpu_without_a_compiler_is_told_before_anything_is_written(photos, tmp
     refused(photos, tmp_path / "out", "--device cpu", kind=BackendError)
 
 
-def test_an_encoder_device_that_is_missing_is_told_before_anything_is_written(photos, tmp_path, monkeypatch):
+def test_an_encoder_device_that_is_missing_is_reported_before_anything_is_written(
+    photos, tmp_path, monkeypatch
+):
     monkeypatch.setattr("torch.backends.mps.is_available", lambda: False)
     config = replace(CONFIG, encoder_device="mps")
     refused(photos, tmp_path / "out", "--encoder-device mps", kind=BackendError, config=config)
@@ -143,7 +145,7 @@ def test_bundled_encoders_warn_of_other_places(tiny_capture, caplog):
     assert "knows only scenes like the demo's" in caplog.text
 
 
-def test_the_time_of_the_features_is_told_first(clip_folder, tmp_path, caplog):
+def test_the_time_of_the_features_is_reported_first(clip_folder, tmp_path, caplog):
     config = replace(CONFIG, clip=str(clip_folder)).resolved("cpu", (400, 300))
     with caplog.at_level(NOTE, logger="lexsplat"):
         check_encoders(config, tmp_path, 50, (400, 300))

@@ -111,7 +111,7 @@ def test_a_run_that_was_stopped_goes_on_with_its_features(tmp_path):
         poses_from_photos(folder, output, listener=stop)
     assert (output / ".poses" / "database.db").is_file()
     assert not (output / "sparse").exists()
-    # Nothing is left to be seen in the photos: what is placed now is placed by features that were kept.
+    # Nothing is left to be seen in the photos: what is registered now is registered by features that were kept.
     for file in folder.iterdir():
         times, size = file.stat().st_mtime_ns, file.stat().st_size
         Image.new("RGB", SIZE).save(file)
@@ -146,7 +146,7 @@ def test_a_video_becomes_a_scene_that_needs_the_video_no_more(tmp_path):
     assert next(iter(capture.views.values())).load_image().shape[2] == 3
 
 
-def test_photos_that_are_gone_are_told(tmp_path):
+def test_photos_that_are_gone_are_reported(tmp_path):
     folder = tmp_path / "photos"
     for index, camera in enumerate(room_cameras()[:5]):
         save(folder / f"{index}.png", room_photo(camera))

@@ -151,7 +151,7 @@ def test_a_build_keeps_the_previous_scene_until_it_is_complete(built_copy, tiny_
     assert not torch.equal(open_scene(built_copy, device="cpu").gaussians.means, before)
 
 
-def test_builds_that_outrun_a_reader_are_told_and_not_taken_for_damage(built_copy, monkeypatch):
+def test_builds_that_outrun_a_reader_are_reported_and_not_taken_for_damage(built_copy, monkeypatch):
     builder, version = Builder(built_copy), itertools.count(1)
 
     def as_if_builds_never_rest(folder):

@@ -213,7 +213,7 @@ def test_things_stand_on_the_floor_of_a_room_however_it_is_turned(degrees):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", [l_shape, bathroom, two_storeys])
-def test_a_room_whose_things_tell_little_of_up_is_upright(scene):
+def test_a_room_whose_things_report_little_of_up_is_upright(scene):
     assert surroundings(scene()).up.direction @ UP > 0.99
 
 

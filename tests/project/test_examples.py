@@ -71,7 +71,7 @@ def test_06_asks_while_it_moves(run):
     assert "of 20 answers were late" in output
 
 
-def test_07_tells_which_scenes_hold_a_thing(run, tmp_path):
+def test_07_reports_which_scenes_hold_a_thing(run, tmp_path):
     output = run("07_library.py")
     assert "red apple: present: yes, in 1 of 1 scene" in output
     assert "fire extinguisher: present: no, in 0 of 1 scene" in output

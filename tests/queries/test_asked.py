@@ -202,7 +202,7 @@ def test_what_people_say_around_a_thing_is_understood(text, expected):
         ("what is in the corner of the table", InCorner(ANY), '"of the table"'),
     ],
 )
-def test_what_a_question_asks_beside_the_thing_is_told(text, expected, told):
+def test_what_a_question_asks_beside_the_thing_is_reported(text, expected, told):
     understood = understand(text)
     assert understood.phrase == expected
     assert told in understood.note

@@ -235,7 +235,7 @@ def test_questions_as_people_ask_them_are_understood(text, expected):
         ("mug diagonally behind the duck", "diagonally"),
     ],
 )
-def test_words_that_name_no_thing_are_told_as_they_were_written_and_the_whole_is_one_thing(text, left):
+def test_words_that_name_no_thing_are_reported_as_they_were_written_and_the_whole_is_one_thing(text, left):
     assert left in text
     understood = understand(text)
     assert understood.note == f'not understood ("{left}"): asked for as one thing, in these words'
@@ -380,7 +380,7 @@ def test_orders_parts_and_statements_can_be_read(text, read):
     ("text", "told"),
     [("is the mug full?", "full"), ("is the mug big?", "big"), ("what color is the mug?", "colors")],
 )
-def test_what_an_answer_does_not_tell_is_said(text, told):
+def test_what_an_answer_does_not_report_is_said(text, told):
     assert told in understand(text).note
 
 
@@ -400,7 +400,7 @@ def test_words_in_quotation_marks_keep_their_form():
         ("horse", "horse"), ("theremin", "theremin"), ("mugs", "mugs"), ("日本", "日本"),
     ],
 )  # fmt: skip
-def test_typing_errors_are_mended_and_other_words_are_not(typed, meant):
+def test_typing_errors_are_corrected_and_other_words_are_not(typed, meant):
     assert corrected(typed, ["rubber duck", "banana", "house", "mug", "striped ball", "candle"]) == meant
 
 
@@ -417,7 +417,7 @@ def test_numbers_are_words_that_only_a_vocabulary_knows():
 
 
 @pytest.mark.parametrize(
-    ("text", "expected", "mended"),
+    ("text", "expected", "right"),
     [
         ("teh mug", MUG, "the"),
         ("whre is the mug?", MUG, "where"),
@@ -429,10 +429,10 @@ def test_numbers_are_words_that_only_a_vocabulary_knows():
         ("yelow mug", Thing("yellow mug"), "yellow"),
     ],
 )
-def test_typing_errors_in_the_words_of_a_question_are_mended_and_told(text, expected, mended):
+def test_typing_errors_in_the_words_of_a_question_are_corrected_and_noted(text, expected, right):
     understood = understand(text)
     assert understood.phrase == expected
-    assert f'asked for "{mended}"' in understood.note
+    assert f'asked for "{right}"' in understood.note
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def evidence_of(parts, texts: torch.Tensor) -> list[Evidence]:
     )
 
 
-def test_what_is_there_is_told_from_what_is_not(parts):
+def test_what_is_there_is_distinguished_from_what_is_not(parts):
     _, field, _ = parts
     absent = unit(torch.randn(20, 12, generator=torch.Generator().manual_seed(9)), dim=1)
     assert [evidence.presence for evidence in evidence_of(parts, field.codebook.clip)] == ["yes"] * 5
@@ -103,7 +103,7 @@ class Words:
 
 
 @pytest.fixture
-def judge(monkeypatch):
+def classifier(monkeypatch):
     """A red 0, a green 1, a ball 2 with one stripe like 3, and much of nothing."""
     from lexsplat.queries import presence
 
@@ -128,21 +128,21 @@ def judge(monkeypatch):
     return classifier
 
 
-def strength(judge, phrase):
-    return judge.evidence([phrase], Words()([phrase]), torch.zeros(1, 500))[0].strength
+def strength(classifier, phrase):
+    return classifier.evidence([phrase], Words()([phrase]), torch.zeros(1, 500))[0].strength
 
 
-def test_objects_are_judged_and_not_their_parts(judge):
-    assert strength(judge, "2") > YES
-    assert strength(judge, "3") < NO, "a stripe of the ball"
+def test_objects_are_compared_and_not_their_parts(classifier):
+    assert strength(classifier, "2") > YES
+    assert strength(classifier, "3") < NO, "a stripe of the ball"
 
 
-def test_compounds_need_the_strength_of_objects_and_colors_more(judge, monkeypatch):
+def test_compounds_need_the_strength_of_objects_and_colors_more(classifier, monkeypatch):
     from lexsplat.queries import presence
 
     monkeypatch.setattr(presence, "is_part", lambda phrase: phrase == "3")
     phrases = ["3", "2", "red 0"]
-    found = judge.evidence(phrases, Words()(phrases), torch.zeros(3, 500))
+    found = classifier.evidence(phrases, Words()(phrases), torch.zeros(3, 500))
     assert [evidence.yes for evidence in found] == [0.62, 0.62, 0.82]
     assert Evidence(0.7, 0.7, found[0].yes).presence == "yes"
 
@@ -156,12 +156,12 @@ def test_compounds_need_the_strength_of_objects_and_colors_more(judge, monkeypat
         ("5", "no"),  # nowhere
     ],
 )
-def test_a_part_is_there_only_with_its_thing(judge, monkeypatch, thing, presence):
+def test_a_part_is_there_only_with_its_thing(classifier, monkeypatch, thing, presence):
     from lexsplat.queries import presence as module
 
     monkeypatch.setattr(module, "is_part", lambda phrase: phrase == "3 handle")
     monkeypatch.setattr(module, "thing_of_part", lambda phrase: thing if phrase == "3 handle" else "")
-    (found,) = judge.evidence(["3 handle"], Words()(["3"]), torch.zeros(1, 500))
+    (found,) = classifier.evidence(["3 handle"], Words()(["3"]), torch.zeros(1, 500))
     assert found.presence == presence
     assert found.strength == (pytest.approx(1, abs=0.1) if presence == "yes" else 0)
     assert (found.yes, found.no) == (module.YES_PART, module.NO_PART)
@@ -169,14 +169,14 @@ def test_a_part_is_there_only_with_its_thing(judge, monkeypatch, thing, presence
         assert dataclasses.replace(found, ratio=strength, height=strength).presence == answer
 
 
-def test_a_color_is_that_of_the_thing(judge):
-    assert min(strength(judge, phrase) for phrase in ("red 0", "green 1")) > YES
-    assert max(strength(judge, phrase) for phrase in ("green 0", "red 1")) < YES
+def test_a_color_is_that_of_the_thing(classifier):
+    assert min(strength(classifier, phrase) for phrase in ("red 0", "green 1")) > YES
+    assert max(strength(classifier, phrase) for phrase in ("green 0", "red 1")) < YES
 
 
-def test_things_with_a_color_are_compared_with_objects_in_any_color(judge):
-    embed, scale, codes = Words(), judge.scale, judge.language.codebook.clip
-    found = judge.best_heights(["0", "red 0", "green 0"])
+def test_things_with_a_color_are_compared_with_objects_in_any_color(classifier):
+    embed, scale, codes = Words(), classifier.scale, classifier.language.codebook.clip
+    found = classifier.best_heights(["0", "red 0", "green 0"])
     # A stripe is no object, so no phrase of "3" takes part.
     colored = embed([f"{color} {thing}" for color in ("red", "green") for thing in (0, 1, 2)])
     expected = torch.maximum(scale.best, scale.heights(codes, colored).amax(1))
@@ -184,20 +184,20 @@ def test_things_with_a_color_are_compared_with_objects_in_any_color(judge):
     assert (expected[:2] > 1.1 * scale.best[:2]).all(), "the red 0 and the green 1"
 
 
-def test_parts_are_compared_with_everyday_words_whatever_their_color(judge, monkeypatch):
+def test_parts_are_compared_with_everyday_words_whatever_their_color(classifier, monkeypatch):
     from lexsplat.queries import presence
 
     monkeypatch.setattr(presence, "is_part", lambda phrase: phrase == "red 0 1")
-    found = judge.best_heights(["red 0 1", "red 0"])
-    assert torch.equal(found[:, 0], judge.scale.best)
-    assert not torch.equal(found[:, 1], judge.scale.best)
+    found = classifier.best_heights(["red 0 1", "red 0"])
+    assert torch.equal(found[:, 0], classifier.scale.best)
+    assert not torch.equal(found[:, 1], classifier.scale.best)
 
 
-def test_the_wrong_color_is_less_relevant_at_a_thing(judge):
-    asked, codes = ["green 0", "red 0"], judge.language.codebook.clip
+def test_the_wrong_color_is_less_relevant_at_a_thing(classifier):
+    asked, codes = ["green 0", "red 0"], classifier.language.codebook.clip
     texts = Words()(asked)
-    plain = judge.scale.relevancy(codes, texts)
-    colored = judge.scale.relevancy(codes, texts, judge.best_heights(asked))
+    plain = classifier.scale.relevancy(codes, texts)
+    colored = classifier.scale.relevancy(codes, texts, classifier.best_heights(asked))
     assert colored[0, 0] < 0.5 * plain[0, 0], "a green 0 where the 0 is red"
     assert colored[0, 1] == plain[0, 1] > 0.9
 
@@ -245,23 +245,25 @@ def mug_and_handle():
 
 
 def test_the_body_of_a_mug_is_no_mug_handle(mug_and_handle):
-    scale, codewords, judge, embed = mug_and_handle
+    scale, codewords, classifier, embed = mug_and_handle
     asked = ["mug handle", "mug"]
-    body, handle = scale.relevancy(codewords, embed(asked), judge.best_heights(asked))[:2]
+    body, handle = scale.relevancy(codewords, embed(asked), classifier.best_heights(asked))[:2]
     assert body[0] < 0.5 < handle[0]
     assert handle[1] > 0.5, "the handle belongs to the mug"
     alone = scale.relevancy(codewords, embed(asked))
     assert alone[0, 0] > 0.5, "everyday words alone do not tell them apart"
-    assert torch.equal(alone[:, 1], scale.relevancy(codewords, embed(asked), judge.best_heights(asked))[:, 1])
+    assert torch.equal(
+        alone[:, 1], scale.relevancy(codewords, embed(asked), classifier.best_heights(asked))[:, 1]
+    )
 
 
 def test_a_part_is_compared_with_its_thing_by_shares_of_their_best_heights(mug_and_handle):
-    scale, codewords, judge, embed = mug_and_handle
+    scale, codewords, classifier, embed = mug_and_handle
     heights = scale.heights(codewords, embed(["mug handle", "mug"])).double()
     top = heights.topk(1, dim=0).values[0]  # 4 % of 34 codes is one
     over_thing = (heights[:, 0] / top[0]) / (heights[:, 1].clamp_min(1e-6) / top[1]) / 1.05
     over_words = heights[:, 0] / scale.best / 0.72
     own = heights[:, 0] / top[0] / 0.68
     expected = torch.sigmoid(12 * 0.68 * (torch.stack([over_thing, over_words, own]).amin(0) - 1))
-    found = scale.relevancy(codewords, embed(["mug handle"]), judge.best_heights(["mug handle"]))[:, 0]
+    found = scale.relevancy(codewords, embed(["mug handle"]), classifier.best_heights(["mug handle"]))[:, 0]
     torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)

@@ -255,7 +255,7 @@ def test_questions_are_answered_with_the_things_that_fit(select, text, expected)
         ("which is bigger, the ball or the bear?", "no", 'nothing fits "bear"'),
     ],
 )
-def test_what_is_missing_of_several_is_told(select, text, present, note):
+def test_what_is_missing_of_several_is_reported(select, text, present, note):
     sure = {"ball": "yes", "table": "unsure", "bear": "no"}
     words = {**NAMES, "bear": ("lamp",)}
     searched = Searched(lambda word: replace(select(*words[word]), present=sure[word]), lambda _: FRONT)

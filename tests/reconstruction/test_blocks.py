@@ -470,7 +470,7 @@ def rolled(capture, folder):
         ("2", r"error: --blocks: expected a ground plane, .*; give --up X,Y,Z or --blocks none"),
     ],
 )
-def test_a_command_tells_in_one_line_why_it_cannot_cut(count, message, capture, tmp_path, capsys):
+def test_a_command_reports_in_one_line_why_it_cannot_cut(count, message, capture, tmp_path, capsys):
     source = capture.root if count == "200" else rolled(capture, tmp_path / "rolled")
     arguments = ["reconstruct", str(source), "--output", str(tmp_path / "scene"), *QUICK_BUILD]
     assert cli.main([*arguments, "--blocks", count]) == 1

@@ -90,7 +90,7 @@ def test_photos_of_several_sizes_and_too_many_processes_are_refused(three_ranks,
         PartReconstructor(two, CONFIG, points, device="cpu")
 
 
-def test_without_torchrun_the_remedy_is_told_in_one_line(monkeypatch, tmp_path):
+def test_without_torchrun_the_remedy_is_reported_in_one_line(monkeypatch, tmp_path):
     from lexsplat.pipeline import several_gpus
 
     for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):

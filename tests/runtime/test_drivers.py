@@ -55,7 +55,7 @@ def test_a_cluster_used_from_outside_gives_the_bits_of_this_process_and_names_wh
     assert ended.stdout.strip() == "True photo 2: expected a photo, found a torn file; replace it"
 
 
-def test_without_the_client_of_ray_the_remedy_is_told(monkeypatch):
+def test_without_the_client_of_ray_the_remedy_is_reported(monkeypatch):
     pytest.importorskip("ray", reason="needs Ray: pip install 'lexsplat[cluster]'")
     monkeypatch.setitem(sys.modules, "grpc", None)
     for name in [name for name in sys.modules if name.startswith("ray.util.client")]:

@@ -70,14 +70,14 @@ def test_several_failures_are_one_error_that_names_them():
     [
         (
             OSError(28, "No space left on device", "/x/y"),
-            "found No space left on device: /x/y; mend this and run",
+            "found No space left on device: /x/y; fix this and run",
         ),
         (MemoryError(), "found no memory left; give a smaller --memory"),
-        (ValueError("no such axis"), "found ValueError: no such axis; mend this and run"),
-        (RuntimeError("bad shape"), "found RuntimeError: bad shape; mend this and run"),
+        (ValueError("no such axis"), "found ValueError: no such axis; fix this and run"),
+        (RuntimeError("bad shape"), "found RuntimeError: bad shape; fix this and run"),
     ],
 )
-def test_any_error_of_a_task_is_told_with_its_name_and_the_rest_is_kept(error, told):
+def test_any_error_of_a_task_is_reported_with_its_name_and_the_rest_is_kept(error, told):
     outcomes = list(IN_PROCESS.map(two_nodes.raises_second, error, {f"part {i}": i for i in range(4)}))
     assert [o.result for o in outcomes] == [0, None, 2, 3]
     assert str(outcomes[1].error).startswith(f"part 1: expected a result, {told}")
@@ -107,7 +107,7 @@ def test_other_versions_of_packages_on_a_node_are_a_warning(caplog):
     assert "transformers" not in caplog.text
 
 
-def test_an_object_store_that_is_too_small_is_told_with_the_room_that_all_results_need():
+def test_an_object_store_that_is_too_small_is_reported_with_the_room_that_all_results_need():
     found = str(ray_tasks.store_full(30 << 20, 4, 76 << 20))
     assert found.startswith("object store of Ray: expected room for 4 results of 30MB, found 76MB; start")
 
@@ -158,7 +158,7 @@ def test_a_server_of_the_client_that_did_not_start_in_time_is_asked_once_more(mo
     assert len(tried) == 2
 
 
-def test_a_ray_that_does_not_start_is_told_when_its_first_task_is_sent_and_its_thread_ends(monkeypatch):
+def test_a_ray_that_does_not_start_is_reported_when_its_first_task_is_sent_and_its_thread_ends(monkeypatch):
     def init(**_):
         raise RuntimeError("no room for sockets")
 
@@ -190,7 +190,7 @@ def test_a_folder_is_recognized_by_its_content_and_not_by_its_name(tmp_path):
     assert list((tmp_path / "there").iterdir()) == []
 
 
-def test_without_the_package_the_remedy_is_told(monkeypatch):
+def test_without_the_package_the_remedy_is_reported(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with (
         pytest.raises(WorkersError, match=r"found none installed; pip install 'lexsplat\[cluster\]'"),
@@ -212,7 +212,7 @@ def test_nodes_with_another_version_or_none_or_without_the_capture_are_refused()
             ray_workers._check_probe("a", *answer)
 
 
-def test_another_version_of_ray_is_told_with_the_remedy():
+def test_another_version_of_ray_is_reported_with_the_remedy():
     found = RuntimeError("Version mismatch: The cluster was started with:\n Ray: 2.9.0 Python: 3.11.7")
     assert str(ray_connection._unreachable("head:6379", found)) == (
         "Ray at head:6379: expected the same version, found Version mismatch: The cluster was started with: "
@@ -234,7 +234,7 @@ def test_two_nodes_give_the_bits_of_this_process_in_order(on_ray):
 
 
 @pytest.mark.slow
-def test_a_task_that_fails_on_a_node_is_told_with_its_name_and_the_rest_is_kept(on_ray):
+def test_a_task_that_fails_on_a_node_is_reported_with_its_name_and_the_rest_is_kept(on_ray):
     outcomes = list(on_ray.map(two_nodes.one_broken, None, {str(i): i for i in range(5)}))
     assert [o.result for o in outcomes] == [0, 1, None, 3, 4]
     assert isinstance(outcomes[2].error, CaptureError)
@@ -243,7 +243,7 @@ def test_a_task_that_fails_on_a_node_is_told_with_its_name_and_the_rest_is_kept(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("error", [OSError(28, "No space left", "/x"), MemoryError(), ValueError("axis")])
-def test_any_error_of_a_task_on_a_node_is_told_as_in_this_process(on_ray, error):
+def test_any_error_of_a_task_on_a_node_is_reported_as_in_this_process(on_ray, error):
     items = {f"part {i}": i for i in range(4)}
     here, there = (
         [(o.name, o.result, str(o.error)) for o in each.map(two_nodes.raises_second, error, items)]
@@ -253,7 +253,7 @@ def test_any_error_of_a_task_on_a_node_is_told_as_in_this_process(on_ray, error)
 
 
 @pytest.mark.slow
-def test_warnings_on_a_node_are_told_with_the_name_of_the_task(on_ray, caplog):
+def test_warnings_on_a_node_are_reported_with_the_name_of_the_task(on_ray, caplog):
     list(on_ray.map(two_nodes.warns, None, {"bath": 8}))
     assert "bath: 8 photos are few" in caplog.messages
 
@@ -267,7 +267,7 @@ def test_a_slow_first_task_does_not_idle_the_other_worker(on_ray, tmp_path):
 
 
 @pytest.mark.slow
-def test_nodes_tell_whether_they_see_a_folder_itself(on_ray, tmp_path):
+def test_nodes_report_whether_they_see_a_folder_itself(on_ray, tmp_path):
     with SharedFolder.offered(tmp_path / "there") as folder:
         assert on_ray.see(folder)
         assert not on_ray.see(SharedFolder(folder.path, "that of another machine"))
@@ -280,7 +280,7 @@ def test_a_worker_that_dies_is_replaced(on_ray, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_task_that_kills_every_worker_is_told_and_the_rest_is_kept(on_ray, monkeypatch):
+def test_a_task_that_kills_every_worker_is_reported_and_the_rest_is_kept(on_ray, monkeypatch):
     monkeypatch.setattr(ray_tasks, "RETRIES", 1)
     outcomes = list(on_ray.map(two_nodes.always_dies, None, {str(i): i for i in range(3)}))
     assert [o.result for o in outcomes] == [0, None, 2]
@@ -325,7 +325,7 @@ def test_nodes_killed_at_twenty_random_moments_change_no_bit(nodes, on_ray):
         np.testing.assert_array_equal(found, expected)
 
 
-def test_a_cluster_that_is_not_there_is_told_in_one_line(monkeypatch):
+def test_a_cluster_that_is_not_there_is_reported_in_one_line(monkeypatch):
     pytest.importorskip("ray", reason="needs Ray: pip install 'lexsplat[cluster]'")
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with (

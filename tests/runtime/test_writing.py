@@ -21,7 +21,7 @@ CHANGES = {"os.mkdir": (0,), "os.rename": (0, 1), "os.remove": (0,), "os.rmdir":
            "os.symlink": (1,), "os.truncate": (0,), "os.utime": (0,), "os.chmod": (0,), "shutil.rmtree": (0,)}
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
-def hear(event, arguments):
+def record(event, arguments):
     if event == "open":
         path, mode, flags = arguments
         if isinstance(path, int) or not (flags or 0) & WRITING and not set(str(mode or "")) & set("wax+"):
@@ -34,7 +34,7 @@ def hear(event, arguments):
     written.update(os.path.abspath(os.fsdecode(path)) for path in paths if not isinstance(path, int))
 
 from lexsplat import cli
-sys.addaudithook(hear)
+sys.addaudithook(record)
 status = [cli.main(arguments) for arguments in json.loads(sys.argv[1])]
 print(json.dumps({"status": status, "written": sorted(written)}))
 """
@@ -70,7 +70,7 @@ def test_commands_write_into_their_output_and_nowhere_else(tiny_capture, tmp_pat
     report = json.loads(done.stdout.splitlines()[-1])
     assert report["status"] == [0, 0, 0, 0], done.stderr[-2000:]
     written = [Path(path) for path in report["written"]]
-    assert scene / "scene.json" in written, "the hook hears"
+    assert scene / "scene.json" in written, "the hook records"
     allowed = (scene, pictures, temporary, cache / "lexsplat" / "texts")
     strays = [
         path

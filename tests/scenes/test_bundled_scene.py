@@ -111,7 +111,7 @@ def test_a_scene_named_demo_takes_precedence_and_another_folder_does_not(tmp_pat
     assert not SceneFolder.open("demo").is_bundled
 
 
-def test_a_missing_language_file_is_told_by_its_name(tmp_path):
+def test_a_missing_language_file_is_reported_by_its_name(tmp_path):
     folder = tmp_path / "scene"
     shutil.copytree(BUNDLED_SCENE, folder)
     (folder / "language.safetensors").unlink()

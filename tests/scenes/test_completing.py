@@ -22,8 +22,8 @@ def disk(radius=20):
     return np.hypot(x, y) < radius, np.hypot(x, y)
 
 
-def psnr(found, truth):
-    return -10 * np.log10(((found - truth) ** 2).mean())
+def psnr(found, original):
+    return -10 * np.log10(((found - original) ** 2).mean())
 
 
 def trust_outside(hole):
@@ -32,40 +32,40 @@ def trust_outside(hole):
 
 @pytest.mark.parametrize("edge", [np.inf, 4.0])
 def test_checkers_go_on_in_a_hole_and_end_where_they_ended_around_it(edge):
-    truth, (hole, _) = checkers(edge), disk()
-    picture = np.where(hole[..., None], [1.0, 0, 0], truth)
-    found = completed(picture, hole, trust_outside(hole))
-    assert psnr(found, truth[hole]) > (20 if edge == np.inf else 16)
-    assert psnr(painted(picture, hole, trust_outside(hole)), truth[hole]) < 15, (
+    original, (hole, _) = checkers(edge), disk()
+    image = np.where(hole[..., None], [1.0, 0, 0], original)
+    found = completed(image, hole, trust_outside(hole))
+    assert psnr(found, original[hole]) > (20 if edge == np.inf else 16)
+    assert psnr(painted(image, hole, trust_outside(hole)), original[hole]) < 15, (
         "the colors around are no pattern"
     )
 
 
 def test_a_shadow_and_remains_around_the_hole_do_not_spoil_the_pattern():
-    truth, (hole, away) = checkers(), disk()
+    original, (hole, away) = checkers(), disk()
     random = np.random.default_rng(0)
-    shaded = truth * (1 - 0.5 * np.exp(-np.maximum(away - 20, 0) / 8))[..., None]
-    picture = (shaded + random.normal(0, 0.05, truth.shape)).clip(0, 1)
+    shaded = original * (1 - 0.5 * np.exp(-np.maximum(away - 20, 0) / 8))[..., None]
+    image = (shaded + random.normal(0, 0.05, original.shape)).clip(0, 1)
     remains = (away < 23) & (random.random(away.shape) < 0.5)
-    picture[remains] = [0.9, 0.1, 0.1]
-    found = completed(picture, hole, (away >= 23).astype(float))
-    assert psnr(found, truth[hole]) > 18
-    assert found.mean() > 0.9 * truth[hole].mean(), "as bright as without the shadow"
+    image[remains] = [0.9, 0.1, 0.1]
+    found = completed(image, hole, (away >= 23).astype(float))
+    assert psnr(found, original[hole]) > 18
+    assert found.mean() > 0.9 * original[hole].mean(), "as bright as without the shadow"
 
 
 def test_a_surface_without_a_pattern_takes_the_colors_around():
-    truth = np.linspace(0.3, 0.7, SIZE)[None, :, None] * np.ones((SIZE, 1, 3))
+    original = np.linspace(0.3, 0.7, SIZE)[None, :, None] * np.ones((SIZE, 1, 3))
     hole, _ = disk()
-    noisy = (truth + np.random.default_rng(1).normal(0, 0.05, truth.shape)).clip(0, 1)
-    assert psnr(completed(noisy, hole, trust_outside(hole)), truth[hole]) > 24
+    noisy = (original + np.random.default_rng(1).normal(0, 0.05, original.shape)).clip(0, 1)
+    assert psnr(completed(noisy, hole, trust_outside(hole)), original[hole]) > 24
     plain = np.full((SIZE, SIZE, 3), 0.4)
     np.testing.assert_allclose(completed(plain, hole, trust_outside(hole)), 0.4, atol=1e-6)
 
 
 def test_the_best_shifts_are_the_periods_of_the_pattern():
-    picture = checkers()
+    image = checkers()
     weights = np.ones((SIZE, SIZE))
-    for down, right in self_similar_shifts(picture, weights, weights)[:6]:
+    for down, right in self_similar_shifts(image, weights, weights)[:6]:
         u = (np.cos(TURN) * right + np.sin(TURN) * down) / SQUARE
         v = (np.cos(TURN) * down - np.sin(TURN) * right) / SQUARE
         assert abs(u - round(u)) < 0.1, (u, v)
@@ -74,18 +74,18 @@ def test_the_best_shifts_are_the_periods_of_the_pattern():
 
 
 def test_what_is_not_trusted_is_not_copied():
-    truth, (hole, _) = checkers(), disk()
-    picture, trust = truth.copy(), trust_outside(hole)
-    picture[:, : SIZE // 4] = [0, 1, 0]
+    original, (hole, _) = checkers(), disk()
+    image, trust = original.copy(), trust_outside(hole)
+    image[:, : SIZE // 4] = [0, 1, 0]
     trust[:, : SIZE // 4] = 0
-    found = completed(picture, hole, trust)
+    found = completed(image, hole, trust)
     assert np.abs(found - [0, 1, 0]).sum(1).min() > 0.5
 
 
 def test_a_hole_takes_the_colors_around_by_inverse_squared_distance():
-    picture = np.zeros((1, 5, 3))
-    picture[0, 0], picture[0, 4] = 0.2, 0.8
+    image = np.zeros((1, 5, 3))
+    image[0, 0], image[0, 4] = 0.2, 0.8
     hole = np.array([[False, True, True, True, False]])
-    found = painted(picture, hole, trust_outside(hole))[:, 0]
+    found = painted(image, hole, trust_outside(hole))[:, 0]
     expected = [(0.2 + 0.8 / 9) / (1 + 1 / 9), 0.5, (0.2 / 9 + 0.8) / (1 / 9 + 1)]
     np.testing.assert_allclose(found, expected)

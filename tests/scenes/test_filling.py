@@ -121,7 +121,7 @@ def number_of_sources(fill):
         lambda fill: "fill",
     ],
 )
-def test_a_damaged_fill_is_told_in_one_line(journaled_fill, tmp_path, broken):
+def test_a_damaged_fill_is_reported_in_one_line(journaled_fill, tmp_path, broken):
     scene, header, step = journaled_fill
     journal = tmp_path / "edits.jsonl"
     journal.write_text(f"{header}\n{json.dumps({**step, 'fill': broken(step['fill'])})}\n")
@@ -182,13 +182,13 @@ def test_checkers_go_on_where_a_box_stood_and_nothing_of_its_color_stays(shadow)
     editors = {fill: Editor(scene) for fill in (True, False)}
     for fill, editor in editors.items():
         editor.delete(chosen, fill=fill)
-    truth = alone.render("v4").image.numpy()
+    original = alone.render("v4").image.numpy()
     place = render(scene.gaussians, scene.camera("v4"), features=mask[:, None].float(), color=False)
     seen = place.features[..., 0].numpy() > 0.5
     psnr, pictures = {}, {}
     for fill, editor in editors.items():
         pictures[fill] = editor.scene.render("v4").image.numpy()
-        psnr[fill] = -10 * np.log10(((pictures[fill] - truth)[seen] ** 2).mean())
+        psnr[fill] = -10 * np.log10(((pictures[fill] - original)[seen] ** 2).mean())
     assert psnr[True] > 25, psnr
     assert psnr[False] < 15, psnr
     red = pictures[True][..., 0] - pictures[True][..., 1:].max(-1)

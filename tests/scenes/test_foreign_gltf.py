@@ -113,7 +113,7 @@ def test_a_node_that_mirrors_is_refused_with_what_to_do(tmp_path, scale):
     )
 
 
-def test_a_node_at_coordinates_of_a_map_is_told(tmp_path, caplog):
+def test_a_node_at_coordinates_of_a_map_is_reported(tmp_path, caplog):
     document, binary = of_another(tmp_path / "g.glb", 40)
     document["nodes"][0]["translation"] = [4e5, 5.6e6, 0]
     (tmp_path / "g.glb").write_bytes(glb(document, binary))

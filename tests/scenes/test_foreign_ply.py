@@ -162,7 +162,7 @@ def doubled(path: Path, gaussians, offset: tuple[float, float, float]) -> None:
     path.write_bytes(head.replace(b"property float", b"property double") + b"end_header\n" + table.tobytes())
 
 
-def test_doubles_that_are_rounded_coarsely_are_told_with_the_error_and_a_remedy(tmp_path, caplog):
+def test_doubles_that_are_rounded_coarsely_are_reported_with_the_error_and_a_remedy(tmp_path, caplog):
     g = tame(40)
     g.log_scales[:] = -3  # sizes of 0.05
     doubled(tmp_path / "g.ply", g, (4e5, 5.6e6, 0))
@@ -183,7 +183,7 @@ def test_doubles_that_are_rounded_by_little_are_read_without_a_warning(tmp_path,
     assert caplog.text == ""
 
 
-def test_digits_of_a_text_that_are_rounded_coarsely_are_told(tmp_path, text, caplog):
+def test_digits_of_a_text_that_are_rounded_coarsely_are_reported(tmp_path, text, caplog):
     head, rows = text.split(b"end_header\n")
     rows = b"".join(
         b"5600000.%02d %b\n" % (5 * n, row.split(b" ", 1)[1]) for n, row in enumerate(rows.splitlines())

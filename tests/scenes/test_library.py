@@ -156,7 +156,7 @@ def test_a_kind_is_compared_by_the_names_of_its_members_as_the_scenes_answer_it(
     assert {"toy", "rubber duck", "teddy bear", "toy car"} <= set(compared["toy"])
     assert compared["mug"] == ("mug",)
     typed = spellings_of(understand("tyos").phrase, "bundled")["tyos"]
-    assert {"toy", "rubber duck", "teddy bear"} <= set(typed), "what is mended is compared as well"
+    assert {"toy", "rubber duck", "teddy bear"} <= set(typed), "corrections are compared as well"
 
 
 def test_the_order_and_the_bits_of_an_answer_do_not_depend_on_the_number_of_threads(rooms):
@@ -173,7 +173,7 @@ def test_the_order_and_the_bits_of_an_answer_do_not_depend_on_the_number_of_thre
     assert np.array_equal(*found)
 
 
-def test_a_limit_leaves_the_best_scenes_and_tells_of_the_others(rooms):
+def test_a_limit_leaves_the_best_scenes_and_reports_of_the_others(rooms):
     library = lexsplat.open_library(rooms / "library")
     found = library.search("mug", limit=1)
     assert len(found.hits) == 1
@@ -199,7 +199,7 @@ def test_no_phrase_is_refused(rooms, phrase):
         lexsplat.open_library(rooms / "library").search(phrase)
 
 
-def test_scenes_whose_encoder_is_gone_are_told_and_the_others_answer(rooms_copy, monkeypatch):
+def test_scenes_whose_encoder_is_gone_are_reported_and_the_others_answer(rooms_copy, monkeypatch):
     from lexsplat.runtime.errors import ModelError
 
     known = Library.create.__globals__["load_text"]
@@ -285,7 +285,7 @@ def test_a_library_that_moved_with_its_scenes_finds_them(rooms_copy):
     assert library.verify() == {}
 
 
-def test_a_scene_that_moved_alone_is_told_and_added_under_its_name(rooms_copy):
+def test_a_scene_that_moved_alone_is_reported_and_added_under_its_name(rooms_copy):
     library = Library(rooms_copy / "library")
     (rooms_copy / "kitchen").rename(rooms_copy / "galley")
     for told in (library.search("griffin").skipped["kitchen"], library.verify()["kitchen"]):
@@ -297,7 +297,7 @@ def test_a_scene_that_moved_alone_is_told_and_added_under_its_name(rooms_copy):
     assert hits(library, "vase") == ["kitchen"]
 
 
-def test_a_rebuilt_scene_is_told_and_its_old_codes_are_dropped(rooms_copy):
+def test_a_rebuilt_scene_is_reported_and_its_old_codes_are_dropped(rooms_copy):
     library = Library(rooms_copy / "library")
     write_scene(rooms_copy / "kitchen", OTHERS, build=2)
     assert "rebuilt since it was added" in library.verify()["kitchen"]
@@ -319,7 +319,7 @@ def test_a_scene_that_was_only_copied_is_not_rebuilt(rooms_copy):
     assert library.search("mug").rebuilt == library.verify() == {}
 
 
-def test_a_scene_with_a_cut_record_is_told_with_a_remedy(rooms_copy):
+def test_a_scene_with_a_cut_record_is_reported_with_a_remedy(rooms_copy):
     (rooms_copy / "kitchen" / "scene.json").write_text("{")
     library = Library(rooms_copy / "library")
     for told in (library.search("griffin").skipped["kitchen"], library.verify()["kitchen"]):
@@ -327,7 +327,7 @@ def test_a_scene_with_a_cut_record_is_told_with_a_remedy(rooms_copy):
         assert told.endswith(f"; build it again, or: lexsplat library remove {library.root} kitchen")
 
 
-def test_a_scene_of_another_format_version_is_told(rooms_copy):
+def test_a_scene_of_another_format_version_is_reported(rooms_copy):
     record = read_json(rooms_copy / "kitchen" / "scene.json")
     write_json(rooms_copy / "kitchen" / "scene.json", {**record, "format_version": 99})
     library = Library(rooms_copy / "library")
@@ -415,7 +415,7 @@ def test_libraries_that_were_made_without_checksums_are_checked_by_hashes(rooms_
     "text",
     ["", "{", "[]", "{}", "null", '{"name": "office"}', '{"name": "../../x"}', "\0\0\0\0"],
 )
-def test_a_damaged_record_is_told_and_recovered_from_the_codes(rooms_copy, text):
+def test_a_damaged_record_is_reported_and_recovered_from_the_codes(rooms_copy, text):
     before = contents(rooms_copy / "library" / "scenes")
     (rooms_copy / "library" / "scenes" / "kitchen.json").write_text(text)
     library = Library(rooms_copy / "library")
@@ -428,7 +428,7 @@ def test_a_damaged_record_is_told_and_recovered_from_the_codes(rooms_copy, text)
     )
 
 
-def test_every_changed_byte_of_a_record_is_found_and_mended(rooms_copy):
+def test_every_changed_byte_of_a_record_is_found_and_repaired(rooms_copy):
     """A record without its hash is taken as one of an earlier library: only its own name can be lost that way."""
     path = rooms_copy / "library" / "scenes" / "kitchen.json"
     expected = Library(rooms_copy / "library").add(rooms_copy / "kitchen")
@@ -454,7 +454,7 @@ def test_a_record_is_recovered_without_its_scene(rooms_copy):
     assert path.read_bytes() == before
 
 
-def test_a_lost_record_is_told_and_written_again(rooms_copy):
+def test_a_lost_record_is_reported_and_written_again(rooms_copy):
     library = Library(rooms_copy / "library")
     before = (library.stage / "kitchen.json").read_bytes()
     (library.stage / "kitchen.json").unlink()
@@ -467,7 +467,7 @@ def test_a_lost_record_is_told_and_written_again(rooms_copy):
     assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
 
 
-def test_files_that_nothing_can_be_recovered_from_are_told_with_another_remedy(rooms_copy):
+def test_files_that_nothing_can_be_recovered_from_are_reported_with_another_remedy(rooms_copy):
     library = Library(rooms_copy / "library")
     damage(library.stage / library.record("kitchen").codes_file)
     (library.stage / "kitchen.json").unlink()
@@ -501,7 +501,7 @@ def test_codes_that_a_damaged_record_of_an_early_library_does_not_name_stay(room
     assert list(library.stage.glob("kitchen.*.safetensors"))
 
 
-def test_a_record_with_a_path_that_no_file_can_have_is_told(rooms_copy):
+def test_a_record_with_a_path_that_no_file_can_have_is_reported(rooms_copy):
     path = rooms_copy / "library" / "scenes" / "kitchen.json"
     write_record(dataclasses.replace(read_record(path), path="/a\0b", beside="../nowhere"), path)
     assert "no such folder" in Library(rooms_copy / "library").search("griffin").skipped["kitchen"]
@@ -527,7 +527,7 @@ def test_a_scene_with_a_damaged_record_is_removed_with_all_its_files(rooms_copy)
     assert library.verify() == {}
 
 
-def test_a_record_whose_copy_is_damaged_as_well_is_told_with_another_remedy(rooms_copy):
+def test_a_record_whose_copy_is_damaged_as_well_is_reported_with_another_remedy(rooms_copy):
     library = Library(rooms_copy / "library")
     codes = library.stage / library.record("kitchen").codes_file
     write_tensors(codes, read_tensors(codes)[0], {"record": "{}"})
@@ -597,7 +597,7 @@ def test_files_of_others_are_never_deleted(rooms_copy):
         assert (rooms_copy / "songs" / "library.json").read_text() == text
 
 
-def test_every_changed_byte_of_the_library_file_is_harmless_or_mended(rooms_copy):
+def test_every_changed_byte_of_the_library_file_is_harmless_or_corrected(rooms_copy):
     path = rooms_copy / "library" / "library.json"
     whole = path.read_bytes()
     for place in range(len(whole)):
@@ -728,7 +728,7 @@ def test_a_second_writer_is_refused_and_readers_are_not(rooms_copy):
     library.add(rooms_copy / "kitchen")
 
 
-def test_a_full_disk_is_told_and_the_entry_stays(rooms_copy, monkeypatch):
+def test_a_full_disk_is_reported_and_the_entry_stays(rooms_copy, monkeypatch):
     before = contents(rooms_copy / "library" / "scenes")
     write_scene(rooms_copy / "kitchen", OTHERS, build=2)
     library = Library(rooms_copy / "library")

@@ -61,7 +61,7 @@ def closed(library: Library) -> Library:
     return fresh
 
 
-# -- it tells what the scene tells
+# -- it answers as the scene does
 
 
 @pytest.mark.slow
@@ -149,7 +149,7 @@ def test_kinds_are_answered_by_the_names_of_objects(demo_library):
 @pytest.mark.parametrize(
     "phrase", ["mug next to the vase", "mug or candle", "largest mug", "two mugs", "mugg"]
 )
-def test_relations_and_mended_words_are_answered_by_the_scenes(rooms, phrase):
+def test_relations_and_corrected_words_are_answered_by_the_scenes(rooms, phrase):
     library = Library(rooms / "library")
     for name in ("kitchen", "office"):
         expected = find_phrase(open_scene(rooms / name), phrase)
@@ -175,7 +175,7 @@ def test_a_rebuilt_scene_is_asked_itself(rooms_copy):
     np.testing.assert_allclose(hit.answer["instances"][0]["center"], CENTERS[3], atol=0.2 * RADIUS)
 
 
-def test_a_vanished_scene_is_told_and_not_answered_from_memory(rooms_copy):
+def test_a_vanished_scene_is_reported_and_not_answered_from_memory(rooms_copy):
     shutil.rmtree(rooms_copy / "kitchen")
     found = Library(rooms_copy / "library").search("mug")
     assert found.hits == ()

@@ -36,7 +36,7 @@ def rooms(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("phrase", QUESTIONS)
-def test_a_library_of_one_scene_tells_of_a_phrase_what_the_scene_tells(demo_library, phrase):
+def test_a_library_of_one_scene_reports_of_a_phrase_what_the_scene_reports(demo_library, phrase):
     expected, found = find_phrase(open_scene("demo"), phrase), demo_library.search(phrase).to_dict()
     validated("library", {"library": "x", "phrases": [found]})
     told = ("present", "understood", "note")
@@ -45,7 +45,7 @@ def test_a_library_of_one_scene_tells_of_a_phrase_what_the_scene_tells(demo_libr
         assert {key: hit[key] for key in told} == {key: expected[key] for key in told}
 
 
-def test_a_word_that_is_mended_without_success_is_told_with_what_was_searched(rooms):
+def test_a_word_that_is_corrected_without_success_is_reported_with_what_was_searched(rooms):
     library = Library(rooms / "library")
     library.search("bananna")
     assert library.search("bananna").understood == '"banana"'
@@ -55,7 +55,7 @@ def test_a_word_that_is_mended_without_success_is_told_with_what_was_searched(ro
     assert library.search('"pinao"').note == ""  # in quotation marks: as it is
 
 
-def test_an_encoder_without_a_hit_that_does_not_know_a_word_is_told(tmp_path):
+def test_an_encoder_without_a_hit_that_does_not_know_a_word_is_reported(tmp_path):
     library = Library.create(tmp_path / "library")
     library.add(write_scene(tmp_path / "office", OTHERS))
     library.add("demo")
@@ -101,7 +101,7 @@ def test_people_read_presence_and_what_was_understood(rooms, demo_library, capsy
 
 
 @pytest.mark.parametrize("gone", ["library", "library/scenes"])
-def test_a_library_that_is_gone_while_it_is_open_is_told_until_it_is_back(rooms, tmp_path, gone):
+def test_a_library_that_is_gone_while_it_is_open_is_reported_until_it_is_back(rooms, tmp_path, gone):
     copy = copied(rooms, tmp_path / "rooms")
     library = Library(copy / "library")
     assert library.search("mug").present == "yes"

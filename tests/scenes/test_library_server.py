@@ -152,7 +152,7 @@ def test_a_change_brings_to_the_server_what_it_has_missed(rooms, chroma, tmp_pat
 
 
 @pytest.mark.parametrize("lost", ["a code", "a collection"])
-def test_a_server_that_has_lost_something_is_refused_until_it_is_mended(rooms, chroma, tmp_path, lost):
+def test_a_server_that_has_lost_something_is_refused_until_it_is_repaired(rooms, chroma, tmp_path, lost):
     library = Library.create(tmp_path / "library", index=chroma.url)
     for name in NAMES:
         library.add(rooms / name)
@@ -243,7 +243,7 @@ def answering(status: int, body: object, wait: threading.Event | None = None):
         (200, "0.4.22", "expected Chroma with API 1.x, found '0.4.22'; use Chroma 1"),
         (200, {"hello": 1}, "expected Chroma with API 1.x"),
         (404, "gone", "found status 404"),
-        (507, {"message": "disk full"}, 'disk full"}; the library is whole: mend the server, then run'),
+        (507, {"message": "disk full"}, 'disk full"}; the library is whole: fix the server, then run'),
         (500, "x" * 9999, "found status 500"),
     ],
 )

@@ -11,7 +11,7 @@ def demo() -> Scene:
     return open_scene("demo", device="cpu")
 
 
-def test_a_phrase_that_the_encoder_cuts_is_told_in_the_note(demo):
+def test_a_phrase_that_the_encoder_cuts_is_reported_in_the_note(demo):
     assert "tokens" not in demo.understand("a mug with a blue handle").note
     long = "a mug " + "that my brother and I have painted with very small flowers " * 5
     assert "tokens are left out" in demo.understand(long).note
@@ -49,7 +49,7 @@ def test_one_phrase_that_is_no_words_leaves_the_others_of_a_batch_answered(demo)
 @pytest.mark.parametrize(
     "phrase", ["leftmost toy", "mug at the back", "toy in the back left corner", "toy closest to me"]
 )
-def test_where_somebody_stands_is_told_where_the_answer_depends_on_it(demo, phrase):
+def test_where_somebody_stands_is_reported_where_the_answer_depends_on_it(demo, phrase):
     name = next(iter(demo.cameras))
     assert demo.find(phrase, view=name).note == f"as seen from {name}"
     assert demo.find(phrase).note.startswith("as seen from view_")

@@ -36,7 +36,7 @@ PROMPTS = (
     "something to drink from",
     "the handle of that blue mug",  # in no dictionary
     "Café's über-mug 42!",  # accents, marks and digits
-    "green apple stem",  # judged where its thing is
+    "green apple stem",  # compared where its thing is
     "red mug handle",  # of a thing in another color
     "mug handle",  # cut within the mug
     "pumpkin stalk",
@@ -301,7 +301,7 @@ def test_the_search_box_completes_and_the_keyboard_suffices(page):
     assert page.evaluate(f"{unnamed}.length") == 0
 
 
-def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_told_without_a_text_tower(
+def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_reported_without_a_text_tower(
     browser, published_demo, ball_page
 ):
     with serving(ball_page()) as address:
@@ -345,7 +345,7 @@ def test_in_heat_two_prompts_keep_their_colors_and_the_page_says_so(browser, add
     ("typed", "meant"),
     [("red aple", "red apple"), ("redd aple", "red apple"), ("bananna", "banana"), ("red appl", "red apple")],
 )
-def test_enter_mends_typing_errors_as_python_does_and_says_so(page, demo, typed, meant):
+def test_enter_corrects_typing_errors_as_python_does_and_says_so(page, demo, typed, meant):
     ask(page, typed)
     answer = page.evaluate(
         "(({ phrase, presence, note }) => ({ phrase, presence, note }))(lexsplat.app.answers[0])"
@@ -426,7 +426,7 @@ def test_the_text_tower_of_another_encoder_answers_in_the_page_as_in_python(
     assert float(cosines.min()) > 1 - 1e-3
 
 
-def test_a_large_text_tower_is_loaded_only_after_its_size_was_told(browser, ball_page, tmp_path):
+def test_a_large_text_tower_is_loaded_only_after_its_size_was_reported(browser, ball_page, tmp_path):
     model = tmp_path / "siglip"
     model.mkdir()
     siglip_folder(model, width=32)
@@ -577,7 +577,7 @@ def test_the_picture_comes_before_the_words_and_what_is_typed_meanwhile_is_answe
         page.close()
 
 
-def test_of_too_many_gaussians_those_that_cover_most_from_the_camera_are_drawn_and_it_is_told(
+def test_of_too_many_gaussians_those_that_cover_most_from_the_camera_are_drawn_and_it_is_reported(
     browser, ball_page, monkeypatch
 ):
     """The importance of each is worked out here from the scene: opacity times area over squared depth."""
@@ -666,7 +666,7 @@ def test_nothing_is_drawn_while_nothing_changes(page):
     assert 1 <= drawn <= 2
 
 
-def test_a_damaged_file_and_a_browser_without_webgl_are_told_in_one_line(browser, ball_page, tmp_path):
+def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(browser, ball_page, tmp_path):
     folder = ball_page()
     damaged = tmp_path / "damaged"
     shutil.copytree(folder, damaged)

@@ -65,7 +65,7 @@ def test_what_was_used_least_recently_is_forgotten():
         ("x" * (2 << 20), "at most"),
     ],
 )
-def test_each_line_is_answered_in_the_schema_and_errors_tell_what_was_expected(served_demo, line, told):
+def test_each_line_is_answered_in_the_schema_and_errors_report_what_was_expected(served_demo, line, told):
     answer = answer_line(served_demo, line)
     errors = [error.message for error in Draft202012Validator(SCHEMA).iter_errors(answer)]
     assert not errors, errors
@@ -159,12 +159,12 @@ def test_a_text_that_is_too_long_is_asked_as_one_thing_and_says_so(served_demo, 
         ("mug", ""),
     ],
 )
-def test_a_query_that_is_a_question_tells_how_find_understands_it(served_demo, prompt, understood):
+def test_a_query_that_is_a_question_reports_how_find_understands_it(served_demo, prompt, understood):
     (answer,) = answer_queries(served_demo.scene, prompt, ["view_033"], None, None)["prompts"]
     assert answer["note"] == (understood and f"asked in these words; lexsplat find understands {understood}")
 
 
-def test_a_query_that_is_not_understood_is_told(served_demo):
+def test_a_query_that_is_not_understood_is_reported(served_demo):
     (answer,) = answer_queries(served_demo.scene, "the first mug", ["view_033"], None, None)["prompts"]
     assert answer["note"] == 'not understood ("first"): asked for as one thing, in these words'
 
@@ -194,7 +194,7 @@ def test_a_thing_or_kind_in_a_color_is_the_objects_that_the_list_has_in_this_col
     [("blu mug", "blue mug"), ("duk", "duck"), ("mgu", "mug"), ("appel", "apple"),
      ("teh mug", "mug"), ("whre is the bannana", "banana"), ("orang cone", "orange cone")],
 )  # fmt: skip
-def test_typing_errors_find_what_is_meant_and_are_told(served_demo, typed, understood):
+def test_typing_errors_find_what_is_meant_and_are_reported(served_demo, typed, understood):
     answer = answer_line(served_demo, typed)
     (thing,) = answer["instances"]
     (meant,) = answer_line(served_demo, understood)["instances"]
@@ -212,7 +212,7 @@ def test_typing_errors_find_what_is_meant_and_are_told(served_demo, typed, under
         ("red aples", '"red apple"', "aples", "apple"),
     ],
 )
-def test_plurals_with_typing_errors_are_mended_and_the_word_is_told_as_it_was_typed(
+def test_plurals_with_typing_errors_are_corrected_and_the_word_is_reported_as_it_was_typed(
     served_demo, typed, understood, word, meant
 ):
     answer = answer_line(served_demo, typed)
@@ -245,19 +245,19 @@ def test_what_is_not_understood_stays_unsure_whatever_was_asked_before(served_de
         ("is everything on the floor?", "no", '0 of 14 are (any object on "floor")'),
     ],
 )
-def test_what_is_missing_of_a_question_is_told(served_demo, phrase, present, note):
+def test_what_is_missing_of_a_question_is_reported(served_demo, phrase, present, note):
     answer = answer_line(served_demo, phrase)
     assert (answer["present"], answer["note"]) == (present, note)
 
 
 @pytest.mark.parametrize("typed", ["qzx", "kup", "tape duk"])
-def test_a_word_that_is_none_and_resembles_nothing_here_is_told(served_demo, typed):
+def test_a_word_that_is_none_and_resembles_nothing_here_is_reported(served_demo, typed):
     answer = answer_line(served_demo, typed)
     assert f'"{typed.split()[-1]}"' in answer["note"]
     assert answer["present"] != "yes"
 
 
-def test_a_threshold_that_nothing_reaches_is_told_in_a_whole_sentence(served_demo):
+def test_a_threshold_that_nothing_reaches_is_reported_in_a_whole_sentence(served_demo):
     answer = answer_line(served_demo, '{"ask": "mug", "threshold": 1}')
     assert (answer["count"], answer["instances"]) == (0, [])
     assert answer["sentence"] == 'Nothing reaches the threshold 1 for "mug".'

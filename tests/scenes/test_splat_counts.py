@@ -15,7 +15,7 @@ import pytest
 import torch
 from PIL import Image
 from support.hostile.splats import recounted_glb, recounted_text
-from support.refusals import assert_tells, refused
+from support.refusals import assert_reports, refused
 from support.sog_files import write_streamed
 from support.splats import tame
 
@@ -323,7 +323,7 @@ def test_whatever_is_refused_has_a_remedy_and_no_text_of_python(tmp_path, ending
     path.write_bytes(content)
     with pytest.raises(FileFormatError) as caught:
         read_splats(path)
-    assert_tells(caught.value)
+    assert_reports(caught.value)
     for text in (
         "requires a buffer",
         "Expecting value",

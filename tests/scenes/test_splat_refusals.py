@@ -18,7 +18,7 @@ from lexsplat.scenes.formats.spz import write_spz
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_spz_tells_whether_its_version_degree_or_precision_is_not_supported(tmp_path, version):
+def test_spz_reports_whether_its_version_degree_or_precision_is_not_supported(tmp_path, version):
     path = tmp_path / "g.spz"
     write_spz(tame(20, 2), path, version=version)
     content = path.read_bytes() if version == 4 else gzip.decompress(path.read_bytes())
@@ -33,7 +33,7 @@ def test_spz_tells_whether_its_version_degree_or_precision_is_not_supported(tmp_
     told(4, struct.pack("<I", 5), "version 2 or 3 in gzip, or 4", "found version 5")
 
 
-def test_spz_tells_in_which_container_a_version_was_found(tmp_path):
+def test_spz_reports_in_which_container_a_version_was_found(tmp_path):
     write_spz(tame(20), tmp_path / "g.spz", version=3)
     raw = gzip.decompress((tmp_path / "g.spz").read_bytes())
     refused(tmp_path / "g.spz", raw, "version 2 or 3 in gzip, or 4", "found version 3 without gzip")
@@ -41,7 +41,7 @@ def test_spz_tells_in_which_container_a_version_was_found(tmp_path):
     refused(tmp_path / "g.spz", gzip.compress(four), "found version 4 in gzip")
 
 
-def test_spz_4_tells_where_its_table_cannot_begin(tmp_path):
+def test_spz_4_reports_where_its_table_cannot_begin(tmp_path):
     write_spz(tame(20, 2), tmp_path / "g.spz")
     content = (tmp_path / "g.spz").read_bytes()
     for start in (0, 16):
@@ -96,7 +96,7 @@ def test_spz_with_axes_that_mirror_or_are_unknown_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 19, 21])
-def test_ksplat_tells_the_count_that_disagrees(tmp_path, count):
+def test_ksplat_reports_the_count_that_disagrees(tmp_path, count):
     pytest.importorskip("gaussforge")
     path = tmp_path / "g.ksplat"
     write_compressed(tame(20), path, "ksplat")
@@ -110,7 +110,7 @@ def test_ksplat_tells_the_count_that_disagrees(tmp_path, count):
 MESH = "a mesh or a point cloud"
 
 
-def test_an_empty_or_cut_header_of_a_ply_is_told_as_such(tmp_path):
+def test_an_empty_or_cut_header_of_a_ply_is_reported_as_such(tmp_path):
     path = tmp_path / "g.ply"
     write_ply(tame(20), path)
     content = path.read_bytes()
@@ -120,7 +120,7 @@ def test_an_empty_or_cut_header_of_a_ply_is_told_as_such(tmp_path):
         assert MESH not in refused(path, cut, "found a file that ends in its header", "copy the file again")
 
 
-def test_comments_of_a_ply_may_be_long_and_a_header_that_is_too_long_is_told_as_such(tmp_path):
+def test_comments_of_a_ply_may_be_long_and_a_header_that_is_too_long_is_reported_as_such(tmp_path):
     path = tmp_path / "g.ply"
     write_ply(tame(20), path)
     content = path.read_bytes()
@@ -131,7 +131,7 @@ def test_comments_of_a_ply_may_be_long_and_a_header_that_is_too_long_is_told_as_
         assert MESH not in refused(path, lines, "a header of up to 65,536 bytes", "found more", "shorten")
 
 
-def test_a_header_of_a_ply_with_line_ends_of_other_kinds_is_told_as_such(tmp_path):
+def test_a_header_of_a_ply_with_line_ends_of_other_kinds_is_reported_as_such(tmp_path):
     path = tmp_path / "g.ply"
     write_ply(tame(20), path)
     head, rows = path.read_bytes().split(b"end_header\n", 1)

@@ -11,7 +11,7 @@ from lexsplat.runtime.errors import CaptureError, FileFormatError, LexsplatError
 from lexsplat.scenes.formats.reading import read_splats
 
 
-def assert_tells(error: LexsplatError, *parts: str) -> None:
+def assert_reports(error: LexsplatError, *parts: str) -> None:
     """Assert that the message states subject, expected, found and remedy in one line, and contains ``parts``."""
     message = str(error)
     assert error.subject
@@ -27,7 +27,7 @@ def assert_tells(error: LexsplatError, *parts: str) -> None:
 def fails(path, *parts, kind=CaptureError, **options):
     with pytest.raises(kind) as caught:
         load_capture(path, **options)
-    assert_tells(caught.value, *parts)
+    assert_reports(caught.value, *parts)
 
 
 def refused(path: Path, content: bytes, *parts: str) -> str:
@@ -35,5 +35,5 @@ def refused(path: Path, content: bytes, *parts: str) -> str:
     path.write_bytes(content)
     with pytest.raises(FileFormatError) as caught:
         read_splats(path)
-    assert_tells(caught.value, *parts)
+    assert_reports(caught.value, *parts)
     return str(caught.value)

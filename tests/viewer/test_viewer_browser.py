@@ -59,7 +59,7 @@ def test_a_prompt_is_answered_by_the_server_with_its_scores_and_places(page, vie
     assert all(url.startswith((viewer.url, "blob:", "data:")) for url in page.requested)
 
 
-def test_a_card_tells_how_a_question_was_understood_and_what_was_not(page):
+def test_a_card_reports_how_a_question_was_understood_and_what_was_not(page):
     ask(page, "where can I find the ball 4 next to the ball 0?")
     assert page.locator(".card .understood").inner_text() == "as “ball 4 next to ball 0”"
     ask(page, "why is ball 2 so round")
@@ -69,7 +69,7 @@ def test_a_card_tells_how_a_question_was_understood_and_what_was_not(page):
     assert page.locator(".card .understood").count() == 0
 
 
-def test_an_error_of_the_server_is_told_in_one_line(page):
+def test_an_error_of_the_server_is_reported_in_one_line(page):
     page.fill(".search input", 'ball "1')
     page.keyboard.press("Enter")
     until(page, "document.querySelector('.status')?.textContent.includes('quotation marks in pairs')")
@@ -165,7 +165,7 @@ def test_a_moved_object_looks_in_the_preview_as_it_does_afterwards(page, viewer)
     assert np.abs(preview - after).mean() < 0.3 * np.abs(preview - before).mean()
 
 
-def test_a_page_that_shows_an_earlier_scene_is_told_and_shows_the_present_one(page, viewer):
+def test_a_page_that_shows_an_earlier_scene_is_reported_and_shows_the_present_one(page, viewer):
     from lexsplat.viewer.requests import Asked
 
     viewer.session.edit("delete", Asked("ball 0"), {})
@@ -190,7 +190,7 @@ def test_a_video_is_recorded(page, tmp_path):
     assert size > 500
 
 
-def test_a_video_without_a_picture_is_told_and_not_saved(page):
+def test_a_video_without_a_picture_is_reported_and_not_saved(page):
     told = page.evaluate(
         """async () => {
             const record = MediaRecorder.prototype.start;

@@ -83,7 +83,7 @@ class View:
         return resized(source, size)
 
     def _valid_pixels(self, path: Path) -> tuple[NDArray[np.bool_], bool]:
-        """Pixels that a mask leaves, at the size of the undistorted photo if it was drawn on it; whether it was."""
+        """Valid pixels of a mask at the size of the photo it was drawn on, and whether that is undistorted."""
         mask = read_mask(path, nonzero=True)
         self._check_aspect(path, (mask.shape[1], mask.shape[0]))
         undistorted = self._is_undistorted(mask)

@@ -136,7 +136,7 @@ class Build:
                 self.output,
                 expected=f"{len(tasks)} scenes",
                 found=f"{failed} failed, listed above",
-                remedy="mend their captures and run the same command again; finished scenes are kept",
+                remedy="correct their captures and run the same command again; finished scenes are kept",
             )
 
 

@@ -142,7 +142,7 @@ class Edit:
             return
         if not (self.yes or confirmed(f"Discard all steps in {journal}?")):
             raise QueryError(
-                journal, expected="agreement", found="none", remedy="give --yes to discard all steps"
+                journal, expected="confirmation", found="none", remedy="give --yes to discard all steps"
             )
         journal.unlink()
 

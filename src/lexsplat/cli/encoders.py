@@ -27,7 +27,7 @@ class EncodersCommand:
         capture: Folder of photos or capture for which the time is stated.
         device: Device of the rasterizer.
         encoder_device: Device of the encoders; "auto" takes that of the rasterizer.
-        json: Print one JSON document on standard output.
+        json: Print one JSON document on standard output (docs/schemas/encoders.json).
     """
 
     clip: str = DEFAULT_CLIP

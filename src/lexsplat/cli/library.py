@@ -51,7 +51,7 @@ class LibraryCommand:
         limit: Scenes of an answer, at most.
         thumbnails: Folder of the thumbnails that search writes; "none" writes none.
         confirm: Search the scenes themselves, also where the index suffices.
-        repair: Mend what verify finds.
+        repair: Repair what verify finds.
         index: Address of a Chroma server that proposes scenes, such as http://localhost:8000.
         device: "auto" takes CUDA where there is a GPU.
         json: Print one JSON document on standard output (docs/schemas/library.json).
@@ -97,7 +97,7 @@ class LibraryCommand:
                 self.library,
                 expected="sound entries",
                 found=f"{count} of {len(library.names())} with a problem",
-                remedy="see above" if self.repair else "see above; --repair mends damaged entries",
+                remedy="see above" if self.repair else "see above; --repair repairs damaged entries",
             )
         if document.get("failed"):
             raise LibraryError(

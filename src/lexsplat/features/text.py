@@ -145,7 +145,7 @@ class _Store:
         return self._known[content_hash]
 
     def add(self, content_hash: str, found: dict[str, Tensor]) -> None:
-        """Store what is new, and forget what came first if there is too much."""
+        """Store new texts, and drop the oldest ones if there are too many."""
         known, width = self.read(content_hash), len(next(iter(found.values())))
         if any(len(vector) != width for vector in known.values()):
             known.clear()

@@ -104,7 +104,7 @@ def fit_box(points: NDArray, up: NDArray, spreads: NDArray | None = None) -> Box
     An end is dense where the next 3 % of the length inwards hold .75 % of the points: about a quarter of what they
     hold where the points are spread evenly. Strays are few or near: all but 1 % of the points lie at most 3 % of the
     longest side beyond an end. What is more and farther is a sparse part, such as the pot under a plant. The axes
-    have the smallest footprint, judged without the outermost 1 % and the outermost 5 %, each relative to the
+    have the smallest footprint, measured without the outermost 1 % and the outermost 5 %, each relative to the
     smallest.
 
     Args:

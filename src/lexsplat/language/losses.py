@@ -5,7 +5,8 @@ All are means over pixels or Gaussians, so a random sample of them is an unbiase
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -16,6 +17,60 @@ SmoothingWeight = Literal["max", "linear"]
 
 LOG_MARGIN = 1e-4
 """U is clamped to 1 minus this: -log(1 - U) is infinite at U = 1, which float32 rendering can reach."""
+
+_BLOCK = {"cpu": 4096}
+"""Rows of a block in `mean_in_blocks` by kind of device: on a CPU, activations of so many stay in its cache."""
+_LARGE_BLOCK = 1 << 18
+
+
+def mean_in_blocks(
+    loss: Callable[..., Tensor], rows: Sequence[Tensor], parameters: Sequence[Tensor]
+) -> Tensor:
+    """A mean over rows with its gradients, which holds the activations of one block of rows at a time.
+
+    Value and gradients are those of ``loss(*rows)``, but for the order of sums. Full maps take two thirds of the time
+    on a CPU, and memory for one block. Few rows are one block.
+
+    Args:
+        loss: The mean of a loss over rows of the tensors.
+        rows: Tensors ``[M, ...]``.
+        parameters: Tensors that the loss reads beside its arguments, for their gradients.
+    """
+    count = len(rows[0])
+    block = _BLOCK.get(rows[0].device.type, _LARGE_BLOCK)
+    if count <= block:
+        return loss(*rows)
+    return _BlockedMean.apply(loss, block, len(rows), *rows, *parameters)
+
+
+class _BlockedMean(torch.autograd.Function):
+    """`mean_in_blocks`: gradients are computed with the value."""
+
+    @staticmethod
+    def forward(ctx: Any, loss: Callable[..., Tensor], block: int, number: int, *tensors: Tensor) -> Tensor:
+        rows, parameters = tensors[:number], list(tensors[number:])
+        count, total = len(rows[0]), torch.zeros((), device=rows[0].device, dtype=torch.float64)
+        by_row: list[Tensor | None] = [torch.empty_like(r) if r.requires_grad else None for r in rows]
+        sums = [torch.zeros_like(parameter) for parameter in parameters]
+        for start in range(0, count, block):
+            part = slice(start, start + block)
+            own = [r[part].detach().requires_grad_(r.requires_grad) for r in rows]
+            free = [place for place, row in enumerate(own) if row.requires_grad]
+            with torch.enable_grad():
+                value = loss(*own) * (len(own[0]) / count)
+            found = torch.autograd.grad(value, [*(own[place] for place in free), *parameters])
+            total += value.detach()
+            for place, gradient in zip(free, found):
+                by_row[place][part] = gradient  # type: ignore[index]
+            for sum_, gradient in zip(sums, found[len(free) :]):
+                sum_ += gradient
+        ctx.gradients = (*by_row, *sums)
+        return total.to(rows[0].dtype if rows[0].is_floating_point() else torch.float32)
+
+    @staticmethod
+    def backward(ctx: Any, *outer: Tensor) -> tuple[Tensor | None, ...]:
+        scaled = (None if gradient is None else gradient * outer[0] for gradient in ctx.gradients)
+        return (None, None, None, *scaled)
 
 
 def cross_entropy_loss(logits: Tensor, codes: Tensor, uncertainties: Tensor | None = None) -> Tensor:

@@ -75,7 +75,7 @@ class Asked(Certainty):
     understood: str
     note: Annotated[
         str,
-        Field(description="What was not understood, mended, or chosen among several; empty if nothing."),
+        Field(description="What was not understood, corrected, or chosen among several; empty if nothing."),
     ]
 
 
@@ -265,8 +265,8 @@ class LibraryAnswer(TypedDict):
     """One phrase of ``lexsplat library search --json``."""
 
     phrase: str
-    understood: Annotated[str, Field(description="What was searched, with typing errors mended.")]
-    note: Annotated[str, Field(description="What was not understood or mended; empty if nothing.")]
+    understood: Annotated[str, Field(description="What was searched, with typing errors corrected.")]
+    note: Annotated[str, Field(description="What was not understood or was corrected; empty if nothing.")]
     present: Annotated[
         Literal["yes", "unsure", "no"],
         Field(description='"no": each scene was asked or ruled out, and none holds it.'),

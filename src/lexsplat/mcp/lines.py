@@ -1,4 +1,4 @@
-"""Lines of standard input that the official package drops: mended, or answered with an error of JSON-RPC.
+"""Lines of standard input that the official package drops: repaired, or answered with an error of JSON-RPC.
 
 A client that cuts a text in the middle of an emoji sends half of it ("\\ud83c"), which JSON allows and the package
 does not read; it would wait for its answer.

@@ -1,4 +1,4 @@
-"""Two different things of those that two phrases fit: which are nearest to each other, and the note of it."""
+"""The nearest two different things among those that two phrases name, and a note on the choice."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from lexsplat.queries.scoring import render_gaussian_scores
 from lexsplat.scenes.scene import Scene
 
 _WIDTH = 640
-"""Width of an image with one phrase or none; several share twice of it."""
+"""Width of an image with one phrase or none; the images of several phrases share twice this width."""
 _LINE = 18
 
 
@@ -28,7 +28,7 @@ def picture(scene: Scene, view: str, phrases: Sequence[str]) -> tuple[list[dict[
     Args:
         scene: The scene.
         view: Name of a view.
-        phrases: What the heat is about, understood as by `Scene.find`.
+        phrases: What the heatmaps show, understood as by `Scene.find`.
 
     Raises:
         QueryError: If the view is unknown or a phrase is empty.
@@ -48,7 +48,7 @@ def picture(scene: Scene, view: str, phrases: Sequence[str]) -> tuple[list[dict[
 
 
 def _heat(scene: Scene, camera: Camera, phrase: str) -> tuple[dict[str, Any], np.ndarray]:
-    """What the heat of a phrase shows, and the heat ``[H, W]`` in 0..1: its relevancy, or that of what it finds."""
+    """Facts about the heat of a phrase, and the heat ``[H, W]`` in 0..1: relevancy, or the scores of the answer."""
     understood, found = scene.understand(phrase), scene.find(phrase)
     if isinstance(understood.phrase, Thing):
         heat = scene.relevancy(understood.phrase.text, camera)[0]

@@ -153,5 +153,5 @@ def _writing(path: Path) -> Iterator[None]:
             error.filename or path,
             expected="a place that can be written",
             found=error.strerror or repr(error)[:80],
-            remedy="make room or mend its permissions, or start the server with another --output",
+            remedy="make room or change its permissions, or start the server with another --output",
         ) from error

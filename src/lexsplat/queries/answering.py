@@ -217,7 +217,7 @@ def _is_one_noun(phrase: Both | Together) -> bool:
 
 
 def _united(first: Selection, second: Selection, colors_of_one: bool = False) -> Selection:
-    """The union; of ``colors_of_one`` thing, an instance inside another is a part of it."""
+    """The union; with ``colors_of_one`` thing, an instance inside another is not counted."""
     instances = [*_certain(first), *_certain(second)]
     if colors_of_one:
         instances.sort(key=len, reverse=True)
@@ -308,7 +308,7 @@ def _joined(like: Selection, parts: tuple[Selection, ...], present: Presence | N
 
 
 def _seen(found: Selection, view: str) -> Selection:
-    """An answer that depends on where somebody stands, with a note that says where."""
+    """An answer that depends on a viewpoint, with a note that names the view."""
     notes = (found.note, view and f"as seen from {view}")
     return replace(found, note="; ".join(dict.fromkeys(filter(None, notes))), seen_from=view)
 

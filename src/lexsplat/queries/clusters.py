@@ -50,7 +50,7 @@ def clusters(points: FloatArray, firm: NDArray[np.bool_]) -> NDArray[np.intp]:
     is_firm = firm[found]
     order = np.cumsum(is_firm, axis=1)
     linked = is_firm & (apart < link) & (order <= _NEIGHBORS + 1)  # each is its own nearest
-    # Where too few of them are firm, the search goes on among firm ones.
+    # Where too few neighbors are firm, only firm ones are searched.
     short = np.flatnonzero(
         (order[:, -1] <= _NEIGHBORS * firm) & (apart[:, -1] < np.where(firm, link, np.inf))
     )

@@ -227,7 +227,7 @@ def numbered(phrase: Phrase, count: int, rank: int) -> Phrase | None:
 
 
 def without(phrase: Phrase, other: Phrase) -> Phrase | None:
-    """The phrase with ``other`` taken off what it picks or counts from; None if it does neither."""
+    """The phrase without ``other`` among the things that it picks or counts; None if it does neither."""
     if isinstance(phrase, (Pick, AtLeast)):
         return replace(phrase, target=without(phrase.target, other) or Except(phrase.target, other))
     if isinstance(phrase, (Related, Between, InCorner, InPart)):
@@ -252,7 +252,7 @@ def placed(place: Phrase, target: Phrase) -> Phrase:
 
 
 def has_stray_viewer(phrase: Phrase) -> bool:
-    """Whether whoever asks stands where only a thing can: "me", "mug on me"."""
+    """Whether the viewer takes the place of a thing, as in "me" or "mug on me"."""
     relates = isinstance(phrase, Related) and phrase.relation in TO_VIEWER
     return isinstance(phrase, Viewer) or any(
         has_stray_viewer(part)
@@ -262,7 +262,7 @@ def has_stray_viewer(phrase: Phrase) -> bool:
 
 
 def _numbered(phrase: Pick | Related) -> str:
-    """The number of a pick in front of it: "2nd ", "3 "."""
+    """The rank or number of a pick, as text before it: "2nd ", "3 "."""
     last = {1: "st", 2: "nd", 3: "rd"}.get(phrase.rank if phrase.rank < 20 else phrase.rank % 10, "th")
     rank = f"{phrase.rank}{last} " if phrase.rank > 1 else ""
     return rank + (f"{phrase.count} " if phrase.count > 1 else "")

@@ -8,10 +8,10 @@ describes that place, on the scale of everyday words (`lexsplat.queries.everyday
 - *height*: the height of the phrase there, over those that the scene's best described words reach at their places.
 
 Places are the objects of the scene (`lexsplat.queries.objects`), found with everyday words: a stripe of a ball may
-resemble a book, the ball does not. What names a part of a thing, such as "mug handle", is judged at segments of all
+resemble a book, the ball does not. What names a part of a thing, such as "mug handle", is compared at segments of all
 levels, only where the mug is described too, and is absent with the mug. A phrase with a color, such as "red apple",
 is compared with the colors and names of the scene's objects: at a red mug, "red mug" describes more than "red apple".
-A scene without segments is judged at the Gaussians that score best. ``benchmarks/selection.py`` measures the
+A scene without segments is compared at the Gaussians that score best. ``benchmarks/selection.py`` measures the
 decisions.
 """
 
@@ -88,7 +88,7 @@ class Evidence:
 
 
 class DescribedPlaces(NamedTuple):
-    """Where phrases are judged.
+    """Where presence is decided.
 
     Args:
         distributions: The scene's objects, and what no everyday word describes, as distributions ``[V, K]``.
@@ -201,7 +201,7 @@ class PresenceClassifier:
         whole = whole_segments(
             codes, lambda part: self.strengths(texts[part], codes.distributions), len(words)
         )
-        # What no word describes is judged by its lowest segments.
+        # What no word describes takes part with its lowest segments.
         places = np.unique(np.where(whole.places < 0, codes.numbers[0], whole.places))
         named = whole.words[np.unique(whole.places[whole.places >= 0])]
         return DescribedPlaces(

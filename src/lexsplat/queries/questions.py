@@ -235,7 +235,7 @@ _NO_ERRORS = frozenset(re.findall(r"[a-z]+", " ".join(pattern for pattern, _ in 
 
 
 def with_asking_words(text: str) -> tuple[str, dict[str, str]]:
-    """A question with the typing errors in its question words and colors mended, and what was mended."""
+    """A question with the typing errors in its question words and colors corrected, and the corrections."""
     wrong = frame_errors(text, _FRAME, _vocabulary(), _NO_ERRORS)
     return re.sub(r"[^\W\d_]+", lambda word: wrong.get(word[0], word[0]), text), wrong
 
@@ -324,7 +324,7 @@ def at_one_moment(words: str) -> tuple[str, str]:
 
 
 def says_more(statement: str) -> str:
-    """The word by which a statement says more than the grammar can check; "" if there is none.
+    """The word of a statement that the grammar cannot check; "" if there is none.
 
     "Is only the duck on the table?"; "are all things on the table red?" and "is the largest toy on the table red?".
     """

@@ -33,7 +33,7 @@ BORDER = 0.5
 OWN_SHARE = 0.7
 """Share of a Gaussian's own relevancy in its score; the rest is its segment's."""
 STEEPNESS = 8.0
-"""Slope of the score at the cut, relative to the distance between what is taken and what is left."""
+"""Slope of the score at the cut, relative to the gap between taken and other segments."""
 
 FloatArray = NDArray[np.float64]
 

@@ -72,14 +72,14 @@ def _is_known(word: str, known: set[str]) -> bool:
 
 
 def corrected(phrase: str, vocabulary: Iterable[str]) -> str:
-    """A phrase with typing errors mended (`spellings`)."""
+    """A phrase with typing errors corrected (`spellings`)."""
     return spellings(phrase, vocabulary)[0]
 
 
 def spellings(phrase: str, vocabulary: Iterable[str]) -> tuple[str, ...]:
     """What a phrase may mean, the likeliest first: words of the vocabulary for similar words in no dictionary.
 
-    A word that the dictionary knows is mended only if the vocabulary has one that differs by a doubled letter
+    A word that the dictionary knows is corrected only if the vocabulary has one that differs by a doubled letter
     ("stripped", "striped"), by two neighbors in the other order ("appel"), or by the last of six letters ("orang").
 
     Args:
@@ -87,7 +87,7 @@ def spellings(phrase: str, vocabulary: Iterable[str]) -> tuple[str, ...]:
         vocabulary: Phrases that can be found; their words are the candidates.
 
     Returns:
-        At most `_SPELLINGS`; the phrase itself where nothing is mended.
+        At most `_SPELLINGS`; the phrase itself where nothing is corrected.
     """
     known = _words_of(vocabulary)
     meant = product(*(_meant(word, known) for word in phrase.split()))

@@ -26,7 +26,7 @@ def view_name(viewer: Camera | None, cameras: Mapping[str, Camera]) -> str:
 
 @dataclass
 class Viewers:
-    """The viewers that may decide what is left of a thing, or behind it.
+    """The viewers that may decide what is to the left of a thing, or behind it.
 
     Args:
         relation: One of `DIRECTED`.
@@ -42,10 +42,10 @@ class Viewers:
     def frame(self, target: Selection, reference: Selection) -> Frame:
         """The frame of the view that decides for two things.
 
-        Each view says whether the thing is to the left, to the right or neither (in front, behind or neither). Its
-        weight is the share of its image that the less visible of the two covers. The answer with more than half of
-        the weight is taken, and without one that of the view with the largest weight; views all around a thing do not
-        agree. The view returned is the heaviest one that gives this answer.
+        Each view votes: the thing is to the left, to the right or neither (in front, behind or neither). The weight
+        of a vote is the share of the image that the less visible of the two things covers. The answer with more than
+        half of the weight wins. Views all around a thing have no majority: there the view with the largest weight
+        decides. The view returned is the one with the largest weight among those that give this answer.
         """
         if self.chosen is not None or self.relation not in DIRECTED:
             return self._one
@@ -100,7 +100,7 @@ class Viewers:
         return np.array([float(_shows(camera, one.center)) for camera in cameras])
 
     def _answers(self, target: Selection, reference: Selection) -> NDArray[np.int64]:
-        """What each view says ``[V]``: -1 left or in front, 1 right or behind, 0 neither."""
+        """The vote of each view ``[V]``: -1 left or in front, 1 right or behind, 0 neither."""
         up = self.like.up.direction
         offset = target.center - reference.center
         level = offset - (offset @ up) * up

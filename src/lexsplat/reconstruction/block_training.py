@@ -53,9 +53,9 @@ if TYPE_CHECKING:
     from lexsplat.rendering import Rendering
 
 ROUNDS = 16
-"""Rounds in which all blocks are visited, at least;"""
+"""Least number of rounds, in each of which all blocks are visited."""
 ROUNDS_DEALT = 10
-"""and if all views are dealt: their order does not matter then, and longer visits load less."""
+"""The same if all views are dealt: their order does not matter then, and longer visits load less."""
 ROUND_STEPS = 500
 """Steps of a round at most; longer trainings have more rounds."""
 FEWEST_STEPS = 4

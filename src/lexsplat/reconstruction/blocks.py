@@ -44,9 +44,9 @@ _ALIKE = 0.7
 """Least overlap of the shares of the cells in the pixels of two groups of views that show the same: of nine groups on
 a street it is at most 0.85 between neighbors and 0.65 between the next but one, around a table at least 0.86."""
 _FEWEST_ALIKE = 3
-"""Groups that show the same, at least: two are visited together as they are;"""
+"""Least number of groups that show the same and are dealt; two are visited together as they are."""
 _SHARE_ALIKE = 1 / 3
-"""and their least share of all groups: thin blocks of a street show the same as their neighbors, but not all."""
+"""Their least share of all groups: thin blocks of a street show the same as their neighbors, but not all do."""
 _POINTS_LOOKED_AT = 100_000
 """Points that are projected into all views, drawn from those of a larger capture."""
 _FEWEST_VIEWS = 3

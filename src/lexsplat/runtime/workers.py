@@ -72,7 +72,7 @@ def attempt(work: Callable[[S, T], R], shared: S, name: str, item: T) -> Outcome
 def _task_error(name: str, error: Exception) -> TaskError:
     """The line of an error without a remedy of its own."""
     log.debug("task %s", name, exc_info=error)
-    found, remedy = f"{type(error).__name__}: {error}", "mend this"
+    found, remedy = f"{type(error).__name__}: {error}", "fix this"
     if isinstance(error, OSError):  # such as a full disk
         found = f"{error.strerror or error}" + (f": {error.filename}" if error.filename else "")
     elif isinstance(error, MemoryError):

@@ -168,7 +168,7 @@ def of_kind(scene: Scene, prompt: str, word: Word) -> Word:
     if not members:
         return word
     taken = torch.stack([each.mask for each in members]).any(0)
-    # What is no member stays below the border, and what is a member reaches it.
+    # Members reach the border, and all others stay below it.
     inside, outside = word.scores.clamp(min=BORDER), word.scores.clamp(max=BORDER - 1e-4)
     return replace(word, scores=torch.where(taken, inside, outside), presence="yes")
 

@@ -1,12 +1,14 @@
-"""Completes a picture of a surface where a part of it is missing: its pattern goes on.
+"""Completes an image of a surface where a part of it is missing, by continuing its pattern.
 
-A pattern looks like itself some way further. Shifts by which a picture resembles itself are found by masked
-correlation, and a missing pixel takes the weighted median of what these shifts lead to (after K. He and J. Sun,
-"Statistics of Patch Offsets for Image Completion", ECCV 2012, who choose one shift for each pixel by graph cuts). A
-shift counts as much as it explains the rim of the hole near a pixel, so that edges between two patterns go on too.
+A pattern repeats, so an image of it resembles shifted copies of itself. Masked correlation finds these shifts. A
+missing pixel takes the weighted median of the pixels to which the shifts lead (after K. He and J. Sun, "Statistics of
+Patch Offsets for Image Completion", ECCV 2012, who choose one shift for each pixel by graph cuts). The weight of a
+shift is how well it predicts the rim of the hole near the pixel. Edges between two patterns are therefore continued
+as well.
 
-Shifts are found in the picture over its brightness, in which shadows weigh less. Colors are taken from the picture as
-it is: those of a shadow near the hole are outvoted. What the vote says of the rim decides how far it is believed.
+Shifts are found in the image divided by its local brightness, in which shadows weigh less. Colors are taken from the
+image itself; the median rejects those of a shadow near the hole. The same prediction is made for the rim, where the
+image is known. Its error there decides how far the prediction in the hole is trusted.
 """
 
 from __future__ import annotations
@@ -21,39 +23,39 @@ Mask = NDArray[np.bool_]
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _SHIFTS = 40
 _LEAST = 5
-"""Shortest shift in pixels: neighbors are alike without any pattern."""
+"""Shortest shift in pixels: neighboring pixels are similar without any pattern."""
 _OVERLAP = 0.15
-"""Share of the rim that a shift must map into the known picture."""
+"""Share of the rim that a shift must map into the known image."""
 _BRIGHTNESS, _RIM, _NEAR, _LOCAL = 0.7, 1.5, 1.0, 0.45
-"""Widths in radii of the hole: of the brightness, of the rim for which shifts are sought, of the rim on which they
-are compared for one pixel, and of the neighborhood of that pixel."""
+"""Widths in radii of the hole: of the brightness, of the rim that the shifts must predict, of the rim on which they
+are compared, and of the neighborhood of a pixel in that comparison."""
 _SHARE = 0.3
-"""Width in radii of the hole in which predictions are judged."""
+"""Width of the neighborhood in which predictions are checked, in radii of the hole."""
 _CHANCE, _CERTAIN = 0.1, 0.7
-"""Right shares of a prediction around a pixel: up to the first nothing of it is taken, from the second all."""
+"""Right shares of a prediction around a pixel: below the first it is ignored, from the second it is taken whole."""
 _SOFT = 1.0
 """Excess of a shift's error over the least error, as a share of the latter, that reduces its weight to 1/e."""
 
 
-def completed(picture: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
+def completed(image: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     """Colors ``[F, 3]`` in 0..1 for the F pixels of a hole.
 
     Where no shift explains the rim, they are the colors around (`painted`).
 
     Args:
-        picture: RGB ``[H, W, 3]``.
+        image: RGB ``[H, W, 3]``.
         hole: Pixels to paint ``[H, W]``, at least one.
         trust: How much the color of a pixel counts ``[H, W]``, 0 where it is unknown and in the hole.
     """
-    picture = picture.clip(0, 1)
+    image = image.clip(0, 1)
     radius = max(float(np.sqrt(hole.sum() / np.pi)), 2.0)
     away = np.asarray(distance_transform_edt(~hole)) / radius
-    brightness = mean_around(picture @ _LUMINANCE, trust, _BRIGHTNESS * radius)
-    pattern = (picture / np.maximum(brightness, 0.02)[..., None]).clip(0, 3)
+    brightness = mean_around(image @ _LUMINANCE, trust, _BRIGHTNESS * radius)
+    pattern = (image / np.maximum(brightness, 0.02)[..., None]).clip(0, 3)
     rim = trust * np.exp(-((away / _RIM) ** 2))
     mean = (rim[..., None] * pattern).sum((0, 1)) / rim.sum()
     variance = float((rim[..., None] * (pattern - mean) ** 2).sum() / rim.sum())
-    smooth = painted(picture, hole, trust)
+    smooth = painted(image, hole, trust)
     shifts = self_similar_shifts(pattern, rim, trust)
     if not shifts or variance < 1e-8:
         return smooth
@@ -64,7 +66,7 @@ def completed(picture: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
         there, moved = _moved(trust, shift), _moved(pattern, shift)
         error = ((pattern - moved) ** 2).sum(-1).clip(0, 4 * variance)
         errors.append(mean_around(error, trust * there * near, _LOCAL * radius)[asked])
-        values.append(np.concatenate([_moved(picture, shift)[asked], moved[asked]], 1))
+        values.append(np.concatenate([_moved(image, shift)[asked], moved[asked]], 1))
         trusts.append(there[asked])
     found = np.zeros((*hole.shape, 6))
     found[asked] = _voted(np.stack(values, 1), np.stack(errors, 1), np.stack(trusts, 1))
@@ -73,21 +75,21 @@ def completed(picture: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     return np.asarray((share * found[hole][:, :3] + (1 - share) * smooth).clip(0, 1))
 
 
-def _predictable(picture: FloatArray, found: FloatArray, weights: FloatArray, width: float) -> FloatArray:
-    """Which share of what a prediction adds to the mean around is right nearby ``[H, W]``: a local regression."""
-    mean = mean_around(picture, weights, width)
-    right = mean_around(((picture - mean) * (found - mean)).sum(-1), weights, width)
+def _predictable(image: FloatArray, found: FloatArray, weights: FloatArray, width: float) -> FloatArray:
+    """The share of a prediction, beyond the local mean, that is right nearby ``[H, W]``: a local regression."""
+    mean = mean_around(image, weights, width)
+    right = mean_around(((image - mean) * (found - mean)).sum(-1), weights, width)
     added = mean_around(((found - mean) ** 2).sum(-1), weights, width)
     return np.asarray((right / np.maximum(added, 1e-9)).clip(0, 1))
 
 
 def self_similar_shifts(pattern: FloatArray, weights: FloatArray, trust: FloatArray) -> list[tuple[int, int]]:
-    """The shifts (rows, columns) by which a picture resembles itself best, best first.
+    """The shifts (rows, columns) by which an image resembles itself best, best first.
 
     Args:
-        pattern: The picture ``[H, W, C]``.
+        pattern: The image ``[H, W, C]``.
         weights: How much a pixel counts ``[H, W]``.
-        trust: How much a pixel counts that it is compared with ``[H, W]``.
+        trust: How much a pixel of the shifted image counts ``[H, W]``.
     """
     overlap = _correlation(weights, trust)
     total = np.zeros_like(overlap)
@@ -103,21 +105,21 @@ def self_similar_shifts(pattern: FloatArray, weights: FloatArray, trust: FloatAr
     return [(int(row) - height, int(column) - width) for row, column in places[order]]
 
 
-def painted(picture: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
+def painted(image: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     """Colors ``[F, 3]`` for the F pixels of a hole: those of its rim, weighted by inverse squared distance."""
     away = np.asarray(distance_transform_edt(~hole))
     limit = max(10.0, float(away[trust > 0].min()) + 1)
     points, places = np.argwhere((trust > 0) & (away <= limit)), np.argwhere(hole)
     points = points[:: 1 + len(points) // 1000]
     weights = trust[tuple(points.T)] / ((places[:, None] - points[None]) ** 2).sum(-1)
-    return np.asarray(weights @ picture[tuple(points.T)] / weights.sum(1, keepdims=True))
+    return np.asarray(weights @ image[tuple(points.T)] / weights.sum(1, keepdims=True))
 
 
 def _voted(values: FloatArray, errors: FloatArray, trusts: FloatArray) -> FloatArray:
     """The values ``[F, C]`` of median brightness among ``[F, K, C]``, weighted; the first three are RGB.
 
     Args:
-        values: What each of K shifts leads to.
+        values: The pixels to which each of K shifts leads.
         errors: Their errors ``[F, K]``.
         trusts: How much the values are trusted ``[F, K]``; 0 are left out.
     """
@@ -138,16 +140,16 @@ def _correlation(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.fft.fftshift(np.fft.irfft2(product, size))
 
 
-def _moved(picture: NDArray, shift: tuple[int, int]) -> NDArray:
-    """The picture at p + s for each pixel p; 0 outside."""
-    (height, width), (down, right) = picture.shape[:2], shift
-    moved = np.zeros_like(picture)
+def _moved(image: NDArray, shift: tuple[int, int]) -> NDArray:
+    """The image at p + s for each pixel p; 0 outside."""
+    (height, width), (down, right) = image.shape[:2], shift
+    moved = np.zeros_like(image)
     if abs(down) < height and abs(right) < width:
         rows, columns = (
             slice(max(0, -down), height - max(0, down)),
             slice(max(0, -right), width - max(0, right)),
         )
-        moved[rows, columns] = picture[
+        moved[rows, columns] = image[
             max(0, down) : height + min(0, down), max(0, right) : width + min(0, right)
         ]
     return moved

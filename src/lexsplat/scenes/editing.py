@@ -268,7 +268,7 @@ class Editor:
         return self._whole(chosen, fill=kind == "delete").mask
 
     def _whole(self, chosen: Selection, fill: bool) -> Selection:
-        """A selection with what a step takes along; with ``fill``, also what is hidden inside its things."""
+        """A selection extended to whole things; with ``fill``, also by the hidden Gaussians inside them."""
         whole = whole_things(chosen, self.scene.hidden, self.scene.field.segments)
         if not fill:
             return whole

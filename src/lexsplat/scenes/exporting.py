@@ -216,7 +216,7 @@ def best_labels(found: Sequence[Selection]) -> tuple[Tensor, Tensor]:
 def labels_as_json(found: Sequence[Selection]) -> dict[str, object]:
     """The selections as plain data, with the indices of the Gaussians of every instance.
 
-    Unlike `Selection.to_dict`, it lists instances whatever "present" is: what was selected is what is exported.
+    Unlike `Selection.to_dict`, it lists instances even if "present" is "no": a selection is exported as it is.
     """
     entries = []
     for selection in found:

@@ -1,10 +1,10 @@
 """Fills the hole that a deleted thing leaves in the surface under it, which no photo shows.
 
-1. A thing stands on a surface (`lexsplat.scenes.surfaces`). Its place is what hardly any view sees of it, because the
-   thing is before it.
-2. What the reconstruction put there goes: nothing shows it.
-3. The pattern of the surface goes on in its place (`lexsplat.scenes.completing`), in an image from above. Each
-   painted pixel becomes a flat Gaussian. It keeps the language of its nearest neighbor in the surface.
+1. A thing stands on a surface (`lexsplat.scenes.surfaces`). The hole is the part of the surface that hardly any view
+   sees, because the thing hides it.
+2. Gaussians of the reconstruction in the hole are deleted, because no photo shows them.
+3. The pattern of the surface is continued in the hole (`lexsplat.scenes.completing`), in an image from above. Each
+   painted pixel becomes a flat Gaussian. It takes the language of its nearest neighbor in the surface.
 
 Where no plane is found, such as below a hanging lamp, nothing is filled.
 """
@@ -46,11 +46,11 @@ Mask = NDArray[np.bool_]
 
 _FAINT = 0.1
 _HIDDEN = 0.88
-"""Share of the views that have the thing before a place, above which what the reconstruction put there goes."""
+"""Share of the views in which the thing hides a place, above which the Gaussians there are deleted."""
 _STUFFED = 0.5
-"""Share of the views that have the thing before a Gaussian within its hull, above which that goes too."""
+"""Share of the views in which the thing hides a Gaussian within its hull, above which that is deleted too."""
 _BORDER, _OVERLAP, _RIM = 3, 4, 3
-"""Pixels around such places where it goes too, where the fill covers what stays, and where colors are not trusted."""
+"""Pixels around such places in which Gaussians are deleted, the fill overlaps the rest, and colors do not count."""
 _BARE = 0.6
 """Coverage below which a pixel is bare."""
 _UNSEEN = 0.3
@@ -144,7 +144,7 @@ def hidden_inside(chosen: Selection, hidden: Tensor) -> Tensor:
 
 
 def fill_for(chosen: Selection, cameras: Sequence[Camera] = ()) -> tuple[Fill | None, Tensor]:
-    """What closes the surfaces under the instances of a selection once it is gone, and what goes besides.
+    """The Gaussians that close the surfaces under a deleted selection, and those that are deleted with it.
 
     Args:
         chosen: The selection.
@@ -162,7 +162,7 @@ def fill_for(chosen: Selection, cameras: Sequence[Camera] = ()) -> tuple[Fill | 
 
 
 def _fill_below(thing: Selection, gone: Mask, cameras: Sequence[Camera]) -> Fill | None:
-    """What closes the surface under one thing; remains there are added to ``gone [N]``."""
+    """The Gaussians that close the surface under one thing; remains there are added to ``gone [N]``."""
     gaussians = thing.gaussians
     means = gaussians.means.detach().cpu().double().numpy()
     own, solid = thing.mask.cpu().numpy(), gaussians.opacities.detach().cpu().numpy() >= _FAINT
@@ -196,7 +196,7 @@ def _fill_below(thing: Selection, gone: Mask, cameras: Sequence[Camera]) -> Fill
 
 
 def _stuffing(gaussians: Gaussians, own: Mask, gone: Mask, cameras: Sequence[Camera]) -> Mask:
-    """The Gaussians ``[N]`` within a thing's hull that hardly any view sees, as the thing is there or before them."""
+    """The Gaussians ``[N]`` within a thing's hull that hardly any view sees, because the thing hides them."""
     means = gaussians.means.detach().cpu().double().numpy()
     places = np.flatnonzero(inside_hull(means, own) & ~gone)
     found = np.zeros(len(gone), bool)

@@ -28,7 +28,7 @@ _SHOWN = 40
 
 
 def understood_in(scene: Scene, phrase: str) -> Understood:
-    """How a phrase is understood; its typing errors are mended where the scene holds what is meant.
+    """How a phrase is understood; its typing errors are corrected where the scene holds what is meant.
 
     Raises:
         QueryError: If a part of the phrase is empty.

@@ -43,7 +43,7 @@ class KeptObjects:
 
     Args:
         objects: The objects, as `lexsplat.scenes.objects.objects_of` finds them.
-        places: What phrases are judged at (`lexsplat.queries.presence`).
+        places: Where presence is decided (`lexsplat.queries.presence`).
     """
 
     objects: tuple[Selection, ...]

@@ -207,7 +207,7 @@ def _named_by_words(scene: Scene, words: Sequence[str]) -> tuple[Selection, ...]
 
 
 def _is_part(instance: Selection, other: Selection) -> bool:
-    """Whether another name has most of it: a part of a thing is no object; a coin on a table is one."""
+    """Whether most of it belongs to another name. A part of a thing is no object; a coin on a table is one."""
     shared = int(other.mask[instance.indices].sum())
     return other.phrase not in SURFACES and shared > 0.5 * len(instance)
 

@@ -52,10 +52,10 @@ def read_scene(path: Path, device: str) -> SceneContent:
         except (SceneFolderError, FileFormatError) as error:
             if _state(SceneFolder.open(path)) == _state(folder):
                 raise
-            if attempts == _ATTEMPTS:  # what is missing or half there is so because of the builds
+            if attempts == _ATTEMPTS:  # a build in progress explains what is missing
                 raise SceneFolderError(
                     path,
-                    expected="a scene that rests for the time of reading it",
+                    expected="a scene that does not change while it is read",
                     found=f"builds that changed it {_ATTEMPTS} times",
                     remedy="ask again when they are done",
                 ) from error

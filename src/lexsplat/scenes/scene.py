@@ -302,7 +302,7 @@ class Scene:
         return self._found.get_or_make(key, lambda: find_in(self, understood, camera, threshold))
 
     def understand(self, phrase: str) -> Understood:
-        """How `find` understands a phrase; its typing errors are mended where the scene holds what is meant.
+        """How `find` understands a phrase; its typing errors are corrected where the scene holds what is meant.
 
         Raises:
             QueryError: If a part of the phrase is empty.

@@ -110,7 +110,7 @@ class Averaged:
         )
         if config.averaged.segments:
             run.listener(Event("segments", 0, 1))
-            shown = found.totals * found.visible(config.averaged)  # selections leave out what has no mass
+            shown = found.totals * found.visible(config.averaged)  # selections ignore Gaussians without mass
             with one_thread():
                 field.segments = make_segments(gaussians, found.rows, shown)
             run.listener(Event("segments", 1, 1))

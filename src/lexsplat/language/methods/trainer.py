@@ -16,7 +16,12 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import MASKED_CODE, codes_at_pixels
 from lexsplat.language.fields import TrainedField
-from lexsplat.language.losses import cross_entropy_loss, smoothing_loss, uncertainty_loss
+from lexsplat.language.losses import (
+    cross_entropy_loss,
+    mean_in_blocks,
+    smoothing_loss,
+    uncertainty_loss,
+)
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.reconstruction.optimizers import below_prefix, check_moments, with_prefix
 from lexsplat.rendering import PreparedView
@@ -113,17 +118,22 @@ class FieldTrainer:
 
     def _semantic_terms(self, semantics: Tensor, uncertainty: Tensor, code_map: Any) -> dict[str, Tensor]:
         """Eq. 8 to 12 for rendered maps ``[H, W, 8]`` and ``[H, W]``."""
-        config = self.config
+        config, field = self.config, self.field
         pixels, codes = self._sample_pixels(semantics.shape[0], semantics.shape[1], code_map)
-        # Not [pixels], whose gradient sums repeated rows in an order that depends on the threads.
-        logits = self.field.decode(semantics.flatten(0, 1).index_select(0, pixels))
         if len(pixels) == 0:  # all cells of the view are ignored
             nothing = semantics.sum() * 0
             return {"cross_entropy": nothing, "semantic": nothing}
+        # Not [pixels], whose gradient sums repeated rows in an order that depends on the threads.
+        rows = [semantics.flatten(0, 1).index_select(0, pixels), codes]
+        if config.use_uncertainty:
+            rows.append(uncertainty.flatten().index_select(0, pixels))
+        cross_entropy = mean_in_blocks(
+            lambda s, *rest: cross_entropy_loss(field.decode(s), *rest),
+            rows,
+            list(field.decoder.parameters()),
+        )
         if not config.use_uncertainty:
-            cross_entropy = cross_entropy_loss(logits, codes)
             return {"cross_entropy": cross_entropy, "semantic": config.lambda_ce * cross_entropy}
-        cross_entropy = cross_entropy_loss(logits, codes, uncertainty.flatten().index_select(0, pixels))
         regularizer = uncertainty_loss(self._not_masked(uncertainty, code_map), config.uncertainty_form)
         semantic = config.lambda_ce * cross_entropy + config.lambda_u * regularizer  # Eq. 12
         return {"cross_entropy": cross_entropy, "uncertainty": regularizer, "semantic": semantic}
@@ -161,14 +171,20 @@ class FieldTrainer:
                 torch.randint(count, (config.smoothing_sample,), generator=self.generator), means.device
             )
             means, semantics, logits = (t.index_select(0, rows) for t in (means, semantics, logits))
-        uncertainties = logits.sigmoid() if config.use_uncertainty else torch.zeros_like(logits)
-        return smoothing_loss(
-            field.smoother(means),
-            semantics,
-            uncertainties,
-            config.min_smoothing_weight,
-            weight=config.smoothing_weight,
-            squared=config.smoothing_squared,
+        uncertainties = logits.detach().sigmoid() if config.use_uncertainty else torch.zeros_like(logits)
+
+        def smoothing(means: Tensor, semantics: Tensor, uncertainties: Tensor) -> Tensor:
+            return smoothing_loss(
+                field.smoother(means),
+                semantics,
+                uncertainties,
+                config.min_smoothing_weight,
+                weight=config.smoothing_weight,
+                squared=config.smoothing_squared,
+            )
+
+        return mean_in_blocks(
+            smoothing, (means.detach(), semantics, uncertainties), list(field.smoother.parameters())
         )
 
     def replace_gaussians(self, gaussians: Gaussians, parents: Tensor) -> None:

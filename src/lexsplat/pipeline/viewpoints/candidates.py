@@ -27,16 +27,15 @@ _CLOSEST = 0.5
 _EYE = 0.6
 """Eye height in a room, relative to the free height: 1.5 m of 2.5 m."""
 _GRID = (8, 48)
-"""Columns along either side of the scene in which free places are looked for, at least and at most,"""
+"""Least and largest number of columns along either side of the scene in which free places are looked for."""
 _COLUMN = 0.2
-"""which are this wide, relative to the height of the scene,"""
+"""Width of a column, relative to the height of the scene."""
 _STEPS = 24
-"""heights in each,"""
+"""Heights that are tried in each column."""
 _WALL = 0.05
-"""and distance from solid points within which nothing is free, relative to the height of the scene."""
+"""Distance from solid points within which nothing is free, relative to the height of the scene."""
 _STOREY = 0.3
-"""Least free height of a place, relative to that of the scene: none under a table, but
-in each of three storeys."""
+"""Least free height of a place, relative to that of the scene: none under a table, but in each of three stories."""
 _APART = 0.4
 """Least distance of places within the scene, relative to their free height: every room gets some."""
 _MOST_PLACES = 40

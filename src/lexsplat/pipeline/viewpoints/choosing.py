@@ -1,4 +1,4 @@
-"""The choice of views: those in which the splat looks like something, until nearly all visible Gaussians are seen."""
+"""Chooses views that show surfaces, until nearly all visible Gaussians are in one of them."""
 
 from __future__ import annotations
 
@@ -39,21 +39,21 @@ _FEWEST_VIEWS = 8
 _SAMPLE = 40_000
 """Gaussians whose coverage is followed, at most."""
 _TIMES = 6
-"""Number of views that shall see each Gaussian: the mean over views cancels what is wrong in one."""
+"""Number of views that should see each Gaussian: the mean over views cancels the errors of single ones."""
 _SEEN = 0.1
 """Weight in pixels of a small view at which a Gaussian counts as seen: a quarter of a cell of a feature map."""
 _LEAST_GAIN = 0.001
 """The choice ends when no view adds this share of all coverage."""
 _LEAST_CLEAR = 0.2
-"""Least share of the drawn pixels of a view that show a surface,"""
+"""Least share of the drawn pixels of a good view that show a surface; there is none in a room."""
 _LEAST_OF_BEST = 0.65
-"""and least share relative to good views: where a splat is sharp, a view of fog is no use."""
+"""Least share of such pixels relative to the best views: where a splat is sharp, a view of fog is no use."""
 _ENOUGH = 0.05
-"""Least share of good views among the candidates: a splat that is hazy everywhere is measured by itself,"""
+"""Least share of good views among the candidates of an object; with fewer, both least shares are reduced."""
 _ENOUGH_INSIDE = 0.5
-"""and in a room, which looks the same from everywhere but for the floaters in front,"""
+"""The same in a room, which looks alike from everywhere except for the floaters in front."""
 _LENIENT = (1.0, 0.5, 0.25)
-"""by these parts of both least shares, one after the other."""
+"""Factors on both least shares, tried in this order."""
 _SOME = 1 / 3
 """Where fewer of the clear views see into the scene, it has no inside: a solid thing hides its own middle."""
 _USUALLY_VISIBLE = 0.5

@@ -39,15 +39,15 @@ _MANY = 0.04
 _ENGULFING = 0.8
 """Gaussians are looked at, too, if neighbors are nearer than this many of their middle radii: 1 % of a scene."""
 _VIEWS = 100
-"""Number of views, at most, in which large floaters are looked for,"""
+"""Number of views, at most, in which large floaters are looked for."""
 _ROUNDS = 3
-"""again and again without those that were found, which hid others, at most this many times."""
+"""Number of searches, at most. Each leaves out the floaters found before, because they hide others."""
 _PARTS = 4
 """Suspects are looked for in as many parts, each before the other ones: a wall is made of suspects."""
 _IN_FRONT = 0.5
-"""A large floater is in front of surfaces in this share of what shows it in front of or on one,"""
+"""A large floater lies in front of a surface in this share of the places where it lies in front of or on one."""
 _PIERCED = 0.2
-"""and one that engulfs others, in this share: surfaces pierce it."""
+"""The same share for a floater that engulfs others: surfaces pierce it."""
 _LEAST = 2
 """Least number of points, over all views, at which a floater is in front of a surface."""
 _SAME_DEPTH = (0.05, 0.2)

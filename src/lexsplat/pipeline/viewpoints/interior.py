@@ -30,13 +30,13 @@ _CLEAR = 0.2
 """Least share of surfaces all around a closed place; others are hazy: between the things of a hazy capture it is .13
 in the middle, and .20 at most."""
 _ENCLOSED = 0.4
-"""Least share of closed and hazy places among the free ones of a room: the corners of its box may be outside,"""
+"""Least share of closed and hazy places among the free ones of a room. The corners of its box may be outside."""
 _CLEARLY = 0.1
-"""of closed places alone,"""
+"""Least share of closed places alone among the free ones of a room."""
 _MOSTLY = 0.6
-"""and of these where that is certain."""
+"""Share of closed places from which a room is certain."""
 _PARTLY = 0.2
-"""Share of closed and hazy places above which what is no room might be one."""
+"""Share of closed and hazy places from which an object might be a room."""
 _LEVELS = (0.3, 0.85)
 """Heights, relative to that of the scene, that are looked at, too, where it is closed at eye height: what has legs
 and a neck is open there."""
@@ -46,9 +46,9 @@ and the middle distance of what is seen."""
 _NEAR = 0.05
 """Things are this close to solid points, relative to the same; floaters are not."""
 _THINGS = 0.004
-"""Least share of things in what is seen from the places of a room; an empty shell has 0,"""
+"""Least share of things in what is seen from the places of a room; an empty shell has 0."""
 _CERTAINLY = 0.012
-"""and share above which it is certain."""
+"""Share of things from which a room is certain."""
 _LONELY = 3.0
 """Lonely Gaussians are this many times farther from their neighbors than usual, whatever their size."""
 _NEIGHBORS = 12

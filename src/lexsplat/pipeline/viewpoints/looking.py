@@ -15,7 +15,7 @@ from lexsplat.pipeline.viewpoints.surroundings import Target
 from lexsplat.rendering import prepare, render
 
 SMALL = (96, 72)
-"""Width and height of the views that are looked at, pixels."""
+"""Width and height of the views that are examined, in pixels."""
 _SPREAD = 0.1
 """Standard deviation of depth along a ray, relative to depth, beyond which a pixel shows no surface."""
 _LEAST_DRAWN = 0.15

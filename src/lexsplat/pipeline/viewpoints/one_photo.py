@@ -19,9 +19,9 @@ from lexsplat.rendering.compositing import NEAR
 _WIDEST = math.tan(math.radians(60))
 """Half of the image of the widest lens, in distances from it."""
 _CELLS = 8
-"""Cells along either side of the image, in which Gaussians are counted:"""
+"""Cells along either side of the image, in which Gaussians are counted."""
 _FILLED = 0.75
-"""least share of them with a fourth of the mean number. Things are islands in the image, a photo fills it."""
+"""Least share of cells with a fourth of the mean number. Things are islands in the image; a photo fills it."""
 _CENTERED = 0.1
 """Largest distance of the middle of that image from the optical axis, relative to its size."""
 _SEEN = 0.6

@@ -22,7 +22,7 @@ from lexsplat.runtime.errors import CaptureError
 log = logging.getLogger("lexsplat")
 
 SAMPLE = 30_000
-"""Number of Gaussians that are looked at, at most."""
+"""Largest number of Gaussians that are examined."""
 FEWEST = 50
 """Fewer solid Gaussians show no surface."""
 _NEIGHBORS = 12

@@ -24,15 +24,15 @@ _GROUND_HEIGHT = 0.08
 _GROUND_CELLS = 24
 """Cells along the longer side of the scene in which the ground is counted."""
 _LEAD = 0.15
-"""Difference of the scores of two up directions by which one is certain,"""
+"""Lead in score over the other directions from which an up direction is certain."""
 _GROUND = 0.25
-"""if a ground lies under this share of the scene as seen from above: under a thing alone there is none,"""
+"""Least share of the scene with a ground under it, seen from above: a thing alone has no ground."""
 _WALL = 0.65
-"""and if, where another side has this share and may be a wall or the ground,"""
+"""Share of ground from which another side may be the ground as well, or a wall."""
 _STANDING = 0.5
-"""this share of the things stand on the ground,"""
+"""Least share of the things that must then stand on the ground."""
 _RIVAL = 0.6
-"""and less than this part of it on any other side that may be a ground."""
+"""Limit for the things on any other side that may be a ground, as a part of those on the ground."""
 _UNLIKELY = 0.5
 """Difference of the scores by which a guess is much likelier than another direction."""
 _SAME = math.cos(math.radians(20))
@@ -82,7 +82,7 @@ def find_upward(points: Points, look: Callable[[Points], float]) -> UpwardDirect
     grounds = np.array([ground_share(pieces, direction) for direction in directions])
     standing = standing_shares(pieces, directions)
     plain = np.array([score + look(direction) for direction, score in candidates])
-    # Elsewhere there are no walls to tell from a floor.
+    # Without a large ground there are no walls that could be taken for a floor.
     scores = plain + np.where(grounds > _WALL, standing * grounds, 0)
     kept: list[int] = []
     for index in np.argsort(-scores, kind="stable"):

@@ -32,9 +32,9 @@ SPLATS = "use a .ply of 3D Gaussians; a mesh or a point cloud has none"
 """The remedy for a PLY of something else."""
 
 _NO_GAUSSIANS = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}
-"""Elements in which Apple's SHARP describes its photo,"""
+"""Elements in which Apple's SHARP describes its photo."""
 _MOST_ROWS = 16
-"""in so many rows at most."""
+"""Largest number of rows of such an element."""
 
 _BLOCK = 1 << 20
 """Bytes of text whose numbers are counted at a time."""

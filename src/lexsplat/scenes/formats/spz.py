@@ -138,7 +138,7 @@ def _rotation(extensions: bytes, path: Path) -> NDArray[np.float64]:
 
 
 def _check_supported(magic: bytes, version: int, packed: bool, degree: int, bits: int, path: Path) -> None:
-    """Refuse files of another program or version, and what no version has.
+    """Refuse files of another program or version, and headers that are invalid in every version.
 
     Raises:
         FileFormatError: If it is one.

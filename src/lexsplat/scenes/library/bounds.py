@@ -1,8 +1,8 @@
 """An upper bound of presence from the codes of a scene alone: which scenes may hold a phrase.
 
-`lexsplat.queries.presence` judges a phrase at its best place, a distribution p over the codes that Gaussians carry.
-With the height h_k of the text at code k, the best height b_k of an everyday word there and the peak of the scene,
-its strength is at most
+`lexsplat.queries.presence` decides at the best place of a phrase, a distribution p over the codes that Gaussians
+carry. With the height h_k of the text at code k, the best height b_k of an everyday word there and the peak of the
+scene, its strength is at most
 
     sqrt(max(0, p.h / p.b) max(0, p.h / peak)) <= max over k of h_k / sqrt(b_k peak)
 

@@ -44,7 +44,7 @@ _IMAGES = 8
 _SIDE, _QUALITY = 320, 70
 """Longer side of an image in pixels, and quality of its JPEG."""
 _BEHIND = 0.05
-"""An image shows a point that lies at most this share of its distance behind what is drawn there."""
+"""Largest distance of a point behind the surface that an image shows there, as a share of its depth."""
 _NEIGHBORS = 8
 _FAINT = 0.1
 """Gaussians of lower opacity link nothing, as in `lexsplat.queries.selection`."""
@@ -64,7 +64,7 @@ class Contents:
         rows: First entry of each segment in the two next tensors ``[S + 1]`` int32.
         columns: Codes that occur in each segment, int16.
         shares: Their shares, float16.
-        places: Mean distributions over the codes of the objects ``[V, K]`` float16, where presence is judged.
+        places: Mean distributions over the codes of the objects ``[V, K]`` float16, where presence is decided.
         mean: Mean of the everyday words ``[D]``.
         best: The best height of an everyday word at each code ``[K]``.
         best_colored: The same with the scene's objects in any color ``[K]``.

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from lexsplat.scenes.library.library import Library
 
 _COVERED = 0.3
-"""A pixel shows a thing if the thing covers this share of it."""
+"""Share of a pixel that a thing must cover to be shown by it."""
 _TOLD = 5
 """Largest number of notes, and of skipped scenes, that an answer prints."""
 
@@ -144,8 +144,8 @@ class Found:
 
     Args:
         phrase: What was asked for.
-        understood: What was searched: how it was parsed, with typing errors mended as for the first hit.
-        note: What was not understood, mended or not found; with the scenes if it does not hold for all hits.
+        understood: What was searched: how it was parsed, with typing errors corrected as for the first hit.
+        note: What was not understood, corrected or not found; with the scenes if it does not hold for all hits.
         hits: The scenes that hold it: "yes" before "unsure", then by their bounds.
         scenes: Number of scenes in the library.
         opened: Number of scenes that were asked themselves.

@@ -132,7 +132,7 @@ def telling_errors(root: Path) -> Iterator[None]:
             root if temporary else error.filename or root,
             expected="files that can be written",
             found=str(error.strerror or error),
-            remedy="run the command again when that is mended; the library is as it was before",
+            remedy="run the command again when that is fixed; the library is as it was before",
         ) from error
 
 
@@ -142,7 +142,7 @@ def _damaged(root: Path, expected: str, found: str) -> _DamagedError:
 
 
 def _mending(root: Path, otherwise: str) -> str:
-    """What mends a lost or damaged ``library.json`` beside entries; another remedy where there are none."""
+    """What repairs a lost or damaged ``library.json`` beside entries; another remedy where there are none."""
     mending = (
         f"lexsplat library verify {root} --repair writes it again; an index server has to be filled again"
     )

@@ -149,7 +149,7 @@ def decidable(phrase: str, clip: str) -> Thing | None:
     thing = understood.phrase
     if not isinstance(thing, Thing) or understood.note or (clip == "bundled" and not phrase.isascii()):
         return None
-    if thing_of_part(thing.text):  # judged where its thing is described
+    if thing_of_part(thing.text):  # compared where its thing is described
         return None
     known = words_of_things(clip)
     if clip == "bundled" and strange(thing.text, known):
@@ -282,7 +282,7 @@ def _instance(
 
 
 def _best_view(contents: Contents, part: Array) -> tuple[int, tuple[int, int, int, int]]:
-    """The image that shows most of segments, and the frame around what it shows; -1 if none does."""
+    """The image that shows most of some segments, and the frame around them in it; -1 if none shows them."""
     if not len(part):
         return -1, (0, 0, 0, 0)
     rows, points = _point_rows(contents, part)

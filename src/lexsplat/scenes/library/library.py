@@ -418,14 +418,14 @@ class Library:
         """
         return search(self, phrase, limit, confirm)
 
-    # -- mending it
+    # -- repairing it
 
     def verify(self, repair: bool = False) -> dict[str, str]:
         """What is wrong with each scene, by name: its record, its codes, or its own folder.
 
         Args:
-            repair: Mend what can be mended: read damaged entries and rebuilt scenes again, and bring the server to
-                the state of the library. Scenes that are gone stay.
+            repair: Repair what can be repaired: read damaged entries and rebuilt scenes again, and bring the server
+                to the state of the library. Scenes that are gone stay.
 
         Returns:
             What is (still) wrong; empty if nothing.

@@ -1,4 +1,4 @@
-"""What is wrong with a library, and how it is mended."""
+"""What is wrong with a library, and how it is repaired."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def problems_of(library: Library) -> dict[str, str]:
 
 
 def mended(library: Library) -> dict[str, str]:
-    """Mend what can be mended; what is still wrong, as `problems_of`.
+    """Repair what can be repaired; returns what is still wrong, as `problems_of`.
 
     Raises:
         LibraryError: If another process changes the library, the disk is full, or the server fails.

@@ -235,6 +235,6 @@ def mapped_tensors(path: Path, expected: str) -> dict[str, Tensor]:
 
 
 def damaged(path: Path, expected: str, found: str) -> FileFormatError:
-    """The error of a damaged file in the stage of a library, with what mends it."""
+    """The error of a damaged file in the stage of a library, with what repairs it."""
     remedy = f"lexsplat library verify {path.parents[1]} --repair"
     return FileFormatError(path, expected=expected, found=found, remedy=remedy)

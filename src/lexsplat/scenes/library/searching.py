@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 PROPOSED = 1000
 """Codes that a server proposes for each text."""
 _ASKED = 4
-"""Scenes that are looked at for each one that is wanted, at most."""
+"""Largest number of scenes examined for each scene of the answer."""
 _REBUILT = 2
-"""Rebuilt scenes that are looked at before the others, for each scene that is wanted."""
+"""Rebuilt scenes examined before the others, for each scene of the answer."""
 
 
 def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> Found:
@@ -77,7 +77,7 @@ def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> 
 
 
 def _in_turn(possible: Candidates, limit: int) -> list[tuple[str, float]]:
-    """The candidates in the order in which they are looked at.
+    """The candidates in the order in which they are examined.
 
     Nothing is known of rebuilt scenes. They come first, but many of them would leave no room for the others.
     """
@@ -212,7 +212,7 @@ def _groups(library: Library, records: list[Record], phrase: Phrase) -> tuple[li
 def _bounds(library: Library, records: list[Record], phrase: Phrase) -> list[float]:
     """Bounds of a phrase in scenes of one encoder; -1 for those whose codes are damaged.
 
-    A scene mends typing errors where that helps (`Scene.understand`), so both spellings are compared.
+    A scene corrects typing errors where that helps (`Scene.understand`), so both spellings are compared.
     """
     spellings = spellings_of(phrase, records[0].clip)
     codes = [library.codes(record) for record in records]
@@ -229,7 +229,7 @@ def _bounds(library: Library, records: list[Record], phrase: Phrase) -> list[flo
 
 
 def spellings_of(phrase: Phrase, clip: str) -> dict[str, tuple[str, ...]]:
-    """The texts of the things of a phrase, each with what it may be mended to and the members of its kind."""
+    """The texts of the things of a phrase, each with its possible corrections and the members of its kind."""
     found = {}
     for text in things_of(phrase):
         meant = (text, *spellings(text, words_of_things(clip)))

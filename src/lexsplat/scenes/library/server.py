@@ -1,7 +1,7 @@
 """The codes of a library on an index server: Chroma, by its HTTP API.
 
-The files of the library stay the truth. The server proposes scenes by the inner product of the codes with a text, and
-the bounds of these scenes are computed from their files (`lexsplat.scenes.library.bounds`). The bound of code k is
+The files of the library stay authoritative. The server proposes scenes by the inner product of the codes with a text.
+The bounds of these scenes are computed from their files (`lexsplat.scenes.library.bounds`). The bound of code k is
 
     (u_k.t - c_k - q) / z_k    with z_k = sqrt(b_k peak), c_k = u_k.mean of the everyday words,
 
@@ -192,7 +192,7 @@ class Server:
             count: Number of codes for each text.
 
         Returns:
-            Their names, each once, and what no bound of the others exceeds; minus infinity if there are no others.
+            Their names, each once, and an upper limit for the bounds of the others; minus infinity if there are none.
 
         Raises:
             LibraryError: If the server fails.
@@ -294,7 +294,7 @@ class Server:
             LibraryError: If it does not answer in time, or with an error.
         """
         absent, late, other = self._errors
-        remedy = f"the library is whole: mend the server, then run {self._mending}"
+        remedy = f"the library is whole: fix the server, then run {self._mending}"
         try:
             answer = self._client.request(method, f"{self.url}/api/v2{path}", json=body)
             if answer.is_success:

@@ -9,6 +9,9 @@ from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
 PAGE_FILES = ("page.js", "page.wasm", "page.css", "LICENSES.txt")
 _POLICY = (
     "default-src 'none'; script-src {script} 'wasm-unsafe-eval'; style-src {style}; img-src {images} data: blob:; "
@@ -38,16 +41,15 @@ def single_index(manifest: Mapping[str, Any], style: str, script: str, blocks: s
 
 
 def _index(manifest: Mapping[str, Any], policy: str, style: str, script: str) -> str:
-    """All that others wrote in it is escaped."""
-    values = {
-        "POLICY": html.escape(policy),
-        "TITLE": html.escape(manifest["title"]),
-        "DESCRIPTION": html.escape(manifest["description"] or f"Search {manifest['title']} with words."),
-        "STYLE": style,
-        "SCRIPT": script,
-    }
-    head, *parts = page_file("index.html").decode().split("{{")
-    return head + "".join(values[name] + rest for name, rest in (part.split("}}", 1) for part in parts))
+    """The filled template; everything in it that others wrote is escaped."""
+    page = Environment(autoescape=True, undefined=StrictUndefined, keep_trailing_newline=True)
+    return page.from_string(page_file("index.html").decode()).render(
+        POLICY=policy,
+        TITLE=manifest["title"],
+        DESCRIPTION=manifest["description"] or f"Search {manifest['title']} with words.",
+        STYLE=Markup(style),
+        SCRIPT=Markup(script),
+    )
 
 
 def _source(content: str) -> str:

@@ -59,8 +59,8 @@ def everyday_phrases(bundled: bool = False) -> dict[str, str]:
 def page_phrases(asked: Iterable[str] = (), bundled: bool = False) -> dict[str, str]:
     """The kind of each phrase of a page: the things asked of the scene, then everyday phrases.
 
-    What is no plain thing ("mug left of the duck", "red toy", "small table") is left out: its relevancy is not its
-    answer.
+    Only plain things are taken. "Mug left of the duck", "red toy" and "small table" are not answered by their
+    relevancy alone.
     """
     phrases: dict[str, str] = {}
     for phrase in asked:
