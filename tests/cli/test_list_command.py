@@ -3,6 +3,8 @@
 import csv
 import io
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -86,15 +88,28 @@ def test_an_object_of_a_scene_without_segments_is_found_by_its_word_and_the_list
     plain = demo.with_content(demo.gaussians, field)
     document = list_document(plain)
     assert "no segments" in document["note"]
+    assert "lexsplat language CAPTURE --output SCENE" in document["note"], "how to get them"
     validated("list", document)
     assert {"mug", "pumpkin", "teddy bear"} <= {thing["name"] for thing in document["objects"]}
+
+
+def test_a_table_is_alone_on_standard_output_and_the_rest_is_told_beside_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("lexsplat.scenes.objects.NO_SEGMENTS", "how to get them")
+    old = Path(__file__).parents[1] / "data" / "scene_d4e65b3" / "averaged"
+    scene, sheet = str(shutil.copytree(old, tmp_path / "scene")), str(tmp_path / "sheet.png")
+    assert cli.main(["list", scene, "--csv", "--images", "--output", sheet]) == 0
+    found = capsys.readouterr()
+    assert {len(row) for row in csv.reader(io.StringIO(found.out))} == {14}
+    assert found.err.splitlines()[-2:] == ["no segments: each word is looked for; how to get them", sheet]
 
 
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        (b"", "none"), (b"# nothing\n\n", "none"), (b"\xff\xfe\x00a", "UTF-8"), (b"mug\n\x00\x01\n", "characters"),
-        (b"a" * 200, "characters"), (b"word\n" * 300_000, "bytes"),
+        (b"", "none"), (b"# nothing\n\n", "none"), (b"\xff\xfe\x00a", "UTF-8"),
+        (b"mug\n\x00\x01\n", "printable characters, found '\\x00\\x01'"),
+        (b"a" * 200, "at most 120 characters, found one of 200, 'aaaaaaaaaaaaaaaaaaaa...'"),
+        (b"word\n" * 300_000, "bytes"),
         ("\n".join(map(str, range(MAX_WORDS + 1))).encode(), "2,001"),
     ],
     ids=["empty", "comments alone", "not UTF-8", "not text", "a long name", "a huge file", "too many names"],
@@ -108,12 +123,14 @@ def test_a_damaged_vocabulary_is_refused_in_one_line(tmp_path, capsys, content, 
 
 
 def test_a_missing_vocabulary_and_a_folder_are_refused(tmp_path, capsys):
-    for path in (tmp_path, tmp_path / "nothing"):
-        fails_in_one_line(capsys, ["list", "demo", "--vocabulary", str(path)], "a readable file")
+    for path, found in ((tmp_path, "found a folder"), (tmp_path / "nothing", "found no such file")):
+        fails_in_one_line(capsys, ["list", "demo", "--vocabulary", str(path)], "a readable file", found)
 
 
-@pytest.mark.parametrize("options", [["--csv", "--json"], ["--output", "a.png"]])
-def test_options_that_exclude_each_other_are_refused(options):
+@pytest.mark.parametrize(
+    "options", [["--csv", "--json"], ["--output", "a.png"], ["--images", "--output", "a.jpg"]]
+)
+def test_options_that_contradict_each_other_are_refused(options):
     with pytest.raises(SystemExit) as stop:
         cli.main(["list", "demo", *options])
     assert stop.value.code == 2

@@ -1,5 +1,7 @@
 """Help pages, wrong usage, Ctrl-C and closed pipes of the command line."""
 
+import errno
+import os
 import re
 import subprocess
 import sys
@@ -107,6 +109,21 @@ def test_a_lack_of_memory_is_named_with_its_remedy(error, monkeypatch, capsys):
     monkeypatch.setattr(tyro, "cli", exhausted)
     assert cli.main(["info", "demo"]) == 1
     assert capsys.readouterr().err.startswith("error: out of memory; give a smaller --memory")
+
+
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [(errno.EACCES, "Permission denied; allow it, or give another place"),
+     (errno.ENOSPC, "No space left on device; free some space and run the same command again"),
+     (errno.EIO, "Input/output error")],
+)  # fmt: skip
+def test_an_error_of_the_system_is_one_line_with_its_remedy(number, told, monkeypatch, capsys):
+    def fail(self):
+        raise OSError(number, os.strerror(number), "place/file.png")
+
+    monkeypatch.setattr("lexsplat.cli.info.Info.run", fail)
+    assert cli.main(["info", "demo"]) == 1
+    assert capsys.readouterr().err == f"error: place/file.png: {told}\n"
 
 
 def test_ctrl_c_during_parsing_ends_in_one_line(monkeypatch, capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,16 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 from support.noise_photos import HEIGHT, WIDTH, make_capture
+from support.refusals import assert_reports
 from support.tiny_capture import SPHERES, camera_poses, trace
 
 from lexsplat import cli
-from lexsplat.captures import Capture
+from lexsplat.captures import Capture, load_capture
 from lexsplat.codebook import Codebook
 from lexsplat.features import FeatureMap, external_identity, load_external_features
 from lexsplat.features.encoders import load_clip
+from lexsplat.pipeline.build import build
+from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import FileFormatError, MemoryBudgetError
 
 VIEWS, SIZE = 12, (96, 72)
@@ -182,6 +186,62 @@ def measure(output: Path) -> None:
     metrics = json.loads((output / "metrics.json").read_text())
     assert metrics["language"]["strict"]["auto"]["mIoU"] > 0.7
     assert metrics["language"]["strict"]["mAP"] > 0.9
+
+
+def removed(path: Path) -> None:
+    path.with_name("view_03_s.npy").unlink()
+
+
+def replaced(array: np.ndarray, ending: str = "_s.npy"):
+    return lambda path: np.save(path.with_name(f"view_03{ending}"), array)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (removed, ["view_03_s.npy", "the segments of view_03_f.npy", "no such file"]),
+        (replaced(np.zeros((4, 50, 50))), ["view_03_s.npy", "the photo's aspect, 96x72", "50x50"]),
+        (replaced(np.zeros(96)), ["view_03_s.npy", "[levels, h, w]", "[96]"]),
+        (replaced(np.zeros((0, 72, 96))), ["view_03_s.npy", "[levels, h, w]", "[0, 72, 96]"]),
+        (replaced(np.zeros((0, 128)), "_f.npy"), ["view_03_f.npy", "[n, D]", "[0, 128]"]),
+        (replaced(np.array(["a"]), "_f.npy"), ["view_03_f.npy", "an array of numbers"]),
+    ],
+    ids=["none", "another aspect", "a row", "no level", "no segment", "words"],
+)
+def test_segments_of_another_size_are_reported_before_structure_from_motion_and_reconstruction(
+    tiny_capture, segments, tmp_path, monkeypatch, change, told
+):
+    monkeypatch.setattr("lexsplat.pipeline.build.reconstruct", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr(
+        "lexsplat.pipeline.inputs.poses_from_photos", lambda *_, **__: pytest.fail("too late")
+    )
+    folder = shutil.copytree(segments, tmp_path / "segments")
+    change(folder / "view_03_f.npy")
+    config = BuildConfig(clip="bundled", dino="none", device="cpu", iterations=2, features_from=folder)
+    for source in (tiny_capture, tiny_capture / "images"):
+        with pytest.raises(FileFormatError) as caught:
+            build(source, tmp_path / "scene", config)
+        assert_reports(caught.value, *told)
+        assert not (tmp_path / "scene").exists(), "nothing half-written"
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        (np.full((72, 96), 4), "integers from -1 to 3, found 4 to 4"),
+        (np.full((72, 96), -2), "integers from -1 to 3, found -2 to -2"),
+        (np.full((72, 96), 0.5), "integers from -1 to 3, found 0.5 to 0.5"),
+        (np.full((72, 96), np.nan), "integer segment ids, found NaN"),
+    ],
+)
+def test_segments_with_wrong_numbers_are_refused_with_what_to_do(
+    tiny_capture, segments, tmp_path, numbers, told
+):
+    folder = shutil.copytree(segments, tmp_path / "segments")
+    np.save(folder / "view_03_s.npy", numbers)
+    with pytest.raises(FileFormatError) as caught:
+        load_external_features(folder, load_capture(tiny_capture))["view_03.png"]
+    assert_reports(caught.value, "view_03_s.npy", told)
 
 
 def test_a_view_without_an_array_is_reported_before_anything_is_written(

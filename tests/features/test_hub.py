@@ -221,10 +221,18 @@ def test_a_file_is_refused_with_its_folder_and_a_path_that_is_not_there_without_
     weights = tmp_path / "clip" / "model.safetensors"
     weights.parent.mkdir()
     weights.touch()
+    with pytest.raises(ModelError, match=r"found a file; give another model, a folder \(`--clip FOLDER`\)"):
+        hub.model_folder(str(weights), "clip")  # nothing beside it says that its folder is a model
+    (weights.parent / "config.json").write_text("{}")
     with pytest.raises(
         ModelError, match=f"expected a model folder, found a file; give its folder: --clip {weights.parent}$"
     ):
         hub.model_folder(str(weights), "clip")
+    for name in ("bundeld", "Bundled", "embeded"):
+        with pytest.raises(
+            ModelError, match=f"{name}: expected a model .* no such folder; use `--dino bundled`"
+        ):
+            hub.model_folder(name, "dino")
     for name in (tmp_path / "nowhere", "./nowhere", "~/no where", "models/clip/large"):
         with pytest.raises(
             ModelError, match="expected a model folder, or a name OWNER/NAME, found no such folder"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import shutil
 from pathlib import Path
 
@@ -179,6 +180,13 @@ def test_a_model_saved_without_its_tokenizer_is_refused(clip_copy):
     refused(clip_copy, "a tokenizer (tokenizer.json)")  # without its merges
 
 
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors", "tokenizer.json", ""])
+def test_a_file_without_permission_is_refused(clip_copy, monkeypatch, name):
+    closed, access = clip_copy / name, os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: path != closed and access(path, mode))
+    refused(clip_copy, str(closed), "permission to read it", "none", "chmod")
+
+
 def test_the_tokenizer_of_another_model_is_refused(clip_copy):
     content = json.loads((clip_copy / "tokenizer.json").read_text())
     vocabulary = content["model"]["vocab"]
@@ -304,7 +312,7 @@ def test_an_empty_name_is_not_the_working_directory(clip_folder, monkeypatch):
 
 def test_a_model_of_the_other_kind_is_refused(clip_folder):
     refused(clip_folder, "vision transformer", load=load_dino)
-    refused(hub.BUNDLED_ENCODERS / "dino", "tokenizer")
+    refused(hub.BUNDLED_ENCODERS / "dino", "image-text model", "a 'vit' model without a text tower")
 
 
 def test_siglip_loads_with_its_tokenizer_of_sentencepiece(tmp_path):

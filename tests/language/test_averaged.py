@@ -15,13 +15,13 @@ from torch.nn.functional import normalize
 from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureMap, FeatureMaps
 from lexsplat.language.fields import CodeField
-from lexsplat.language.methods import METHODS
+from lexsplat.language.methods import METHODS, averaging
 from lexsplat.language.methods.averaged import (
     AveragedConfig,
     features_of_codes,
     field_from_means,
 )
-from lexsplat.language.methods.averaging import MeanFeatures, average_features
+from lexsplat.language.methods.averaging import MeanFeatures, average_features, sums_bound
 from lexsplat.language.methods.method import FitRun, TrainingViews
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.queries.visibility import hidden_gaussians
@@ -30,6 +30,7 @@ from lexsplat.runtime.memory import parse_bytes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
+CPU = torch.device("cpu")
 CODES = CodebookConfig(num_codes=5, use_dino=False)
 FULL_SIZE = AveragedConfig(shortest_side=10_000)
 
@@ -164,6 +165,18 @@ def test_less_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_pat
     assert list((tmp_path).rglob("*.*")) == []  # the file of the means has no name
 
 
+def test_sums_on_a_gpu_are_bounded_by_its_free_memory_and_not_by_the_host(monkeypatch) -> None:
+    gpu, free = torch.device("cuda", 0), 24 << 30
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 2 * free))
+    assert sums_bound(gpu, 4 << 30) == free // 2
+    passes = [len(list(averaging._ranges(512, 3_000_000, sums_bound(d, 4 << 30)))) for d in (gpu, CPU)]
+    assert passes == [1, 12]
+    assert sums_bound(CPU, 2 << 30) == 1 << 29
+    assert sums_bound(CPU, 64 << 30) == averaging.MAX_STORE
+    free = 1 << 30
+    assert sums_bound(gpu, 4 << 30) == 1 << 29
+
+
 @pytest.mark.parametrize("memory", ["4GB", "100B"])
 def test_features_that_are_not_read_again_are_freed(memory, small, tmp_path) -> None:
     maps = random_features(small.cameras)
@@ -277,6 +290,24 @@ def test_weights_are_the_softmax_of_the_cosines_by_hand() -> None:
     agreement = np.clip((squares - shared) / (1 - shared), 0, 1)
     expected = 1 - agreement * np.array([1 / 1.25, 3 / 3.25, 0.5])
     np.testing.assert_allclose(field.uncertainties.numpy(), expected, atol=1e-5)
+
+
+def test_weights_and_uncertainties_mean_the_same_in_a_wide_and_in_a_narrow_cone() -> None:
+    """Half of the Gaussians are seen as one thing, the others as two in turn; all features share a direction."""
+    rng = np.random.default_rng(0)
+    first, second = rng.integers(0, 40, 1000), rng.integers(0, 40, 1000)
+    second[::2] = first[::2]
+    fields = []
+    for shared in (0.0, 0.5, 0.73):  # mean cosine of two features
+        things = np.hstack([np.full((40, 1), shared**0.5), (1 - shared) ** 0.5 * np.eye(40)])
+        means = (things[first] + things[second]) / 2
+        found = MeanFeatures(means.astype(np.float16), torch.full((1000,), 100.0))
+        fields.append(field_from_means(found, replace(CODES, num_codes=40), AveragedConfig(), seed=0))
+    differ = first != second
+    for field in fields:
+        assert (field.uncertainties[~differ] < 0.01).all()
+        assert 0.5 < float(field.uncertainties[differ].mean()) < 0.7  # 1 - |F| is 0.29 to 0.07
+        assert float(field.weights[:, 0].mean()) == pytest.approx(0.93, abs=0.04)
 
 
 def test_averages_are_bit_identical_on_any_number_of_threads() -> None:

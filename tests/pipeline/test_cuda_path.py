@@ -164,7 +164,8 @@ def test_features_and_codes_on_the_gpu(pretended_gpu, capture, clip_folder, tmp_
 
 
 @pytest.mark.parametrize("memory", [4 << 30, 4 * 9000])
-def test_averaging_on_the_gpu_finds_the_same_means_and_codes(pretended_gpu, balls, memory):
+def test_averaging_on_the_gpu_finds_the_same_means_and_codes(pretended_gpu, balls, memory, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (memory // 2, memory))
     config = AveragedConfig()
     maps = features_of_codes(balls.code_maps, balls.codebook)
     found = {

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -41,10 +43,10 @@ def photos(tmp_path, monkeypatch) -> Path:
 
 def refused(source: Path, output: Path, *parts: str, kind=CaptureError, config=CONFIG, **options) -> None:
     with pytest.raises(kind) as caught:
-        build(source, output, config, **options)
+        build(source, output / "new" / "scene", config, **options)
     assert isinstance(caught.value, LexsplatError)
     assert_reports(caught.value, *parts)
-    assert not output.exists(), "nothing half-written"
+    assert not output.exists(), "nothing half-written, and no empty folder"
 
 
 def test_ground_truth_is_checked_before_structure_from_motion(photos, tmp_path):
@@ -82,6 +84,19 @@ def test_encoders_are_checked_before_structure_from_motion(photos, clip_folder, 
     folder = shutil.copytree(clip_folder, tmp_path / "clip")
     (folder / "tokenizer.json").unlink()
     refused(photos, tmp_path / "out", "tokenizer", kind=ModelError, config=replace(CONFIG, clip=str(folder)))
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.ENOSPC])
+def test_an_error_of_the_system_before_the_first_stage_leaves_nothing(
+    tiny_capture, tmp_path, monkeypatch, number
+):
+    def fail(*_):
+        raise OSError(number, os.strerror(number), "weights")
+
+    monkeypatch.setattr("lexsplat.pipeline.build.check_encoders", fail)
+    with pytest.raises(OSError, match="weights"):
+        build(tiny_capture, tmp_path / "scene", CONFIG)
+    assert not (tmp_path / "scene").exists(), "nothing half-written"
 
 
 def test_masks_are_checked_before_features_are_searched(tmp_path):

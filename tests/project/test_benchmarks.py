@@ -5,6 +5,7 @@ import runpy
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -70,3 +71,30 @@ def test_operations_of_an_encoder_are_those_of_its_matrix_products(monkeypatch):
         layer(torch.rand(2, 3, 8, 8))
     # The convolution has 2 x 4 outputs of 48 inputs, the linear layer 2 x 8 rows.
     assert dict(products.sizes) == {(1, 8, 48, 8): 1, (1, 16, 4, 5): 1}
+
+
+def test_borders_near_the_outlines_of_masks_are_counted(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import boundaries
+
+    shown = np.zeros((12, 20), int)
+    shown[:, 10:] = 7  # the border is column 9
+    borders = boundaries.borders_of(shown)
+    assert np.array_equal(borders.nonzero()[1], np.full(12, 9))
+    outline = np.zeros((12, 20), bool)
+    outline[3, 5:10] = True  # 4, 3, 2, 1 and 0 pixels away
+    assert boundaries.recall_and_chance(borders, outline, 2) == (3 / 5, 5 / 20)
+    assert boundaries.recall_and_chance(np.zeros_like(borders), outline, 2) == (0, 0)
+
+
+@pytest.mark.slow
+def test_segments_of_two_balls_end_at_their_outlines(built, monkeypatch, tmp_path, capsys):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import boundaries
+
+    monkeypatch.setattr(sys, "argv", ["boundaries.py", str(built), "--pictures", str(tmp_path)])
+    boundaries.main()
+    lines = capsys.readouterr().out.splitlines()
+    recall, chance = (float(word) for word in lines[-1].replace(",", "").split()[5::2])
+    assert recall > chance + 0.2
+    assert len(list(tmp_path.glob("view_*-0.png"))) == 3

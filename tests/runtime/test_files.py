@@ -27,6 +27,16 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
     assert os.listdir(tmp_path) == ["a.json"]
 
 
+def test_an_error_of_the_system_names_the_file_and_not_its_temporary_name(tmp_path):
+    target = tmp_path / "a.png"
+    with pytest.raises(OSError, match="No space left") as caught, atomic_path(target) as temporary:
+        raise OSError(28, "No space left on device", str(temporary))
+    assert caught.value.filename == str(target)
+    with pytest.raises(OSError, match="other") as caught, atomic_path(target):
+        raise OSError(28, "No space left on device", "other")
+    assert caught.value.filename == "other"
+
+
 def test_nan_never_reaches_a_json_file(tmp_path):
     with pytest.raises(ValueError):
         write_json(tmp_path / "a.json", {"psnr": float("nan")})

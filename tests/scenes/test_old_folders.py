@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from lexsplat import open_scene
+from lexsplat import cli, open_scene
 from lexsplat.queries.selection import Selection
 from lexsplat.scenes.editing import Editor
-from lexsplat.scenes.facts import scene_facts
+from lexsplat.scenes.facts import NO_SEGMENTS, scene_facts
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.records import read_record
 
@@ -43,6 +43,21 @@ def test_an_old_folder_answers(method, tmp_path):
     assert bool(((answers.scores >= 0) & (answers.scores <= 1)).all())
     assert float(answers.scores.max()) > float(answers.scores.median()) > 0
     assert scene.relevancy("red apple", next(iter(scene.views))).shape[0] == 1
+
+
+def test_an_old_folder_says_how_to_get_segments(tmp_path, capsys):
+    folder = str(shutil.copytree(OLD / "averaged", tmp_path / "scene"))
+    assert cli.main(["info", folder]) == 0
+    assert f"segments         none: {NO_SEGMENTS}" in capsys.readouterr().out
+    for command in (["query", folder, "red apple", "--no-images"], ["find", folder, "red apple"]):
+        assert cli.main(command) == 0
+        assert capsys.readouterr().out.endswith(f"in this scene\nno segments: {NO_SEGMENTS}\n")
+        assert cli.main([*command, "--json"]) == 0
+        json.loads(capsys.readouterr().out)
+    assert cli.main(["query", folder, "red apple", "--no-images", "--form", "code"]) == 0
+    assert "no segments" not in capsys.readouterr().out, "asked for"
+    assert cli.main(["find", "demo", "red apple"]) == 0
+    assert "no segments" not in capsys.readouterr().out
 
 
 def test_a_scale_stored_in_the_old_spelling_is_kept(tmp_path):

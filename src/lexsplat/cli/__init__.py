@@ -7,6 +7,7 @@ work. Only the module of the given command is imported: ``lexsplat --version`` a
 from __future__ import annotations
 
 import difflib
+import errno
 import importlib
 import logging
 import os
@@ -55,6 +56,12 @@ COMMANDS = {
 }
 """Commands by name, in the order of the help page."""
 
+_REMEDIES = {
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "; allow it, or give another place"),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "; free some space and run the same command again"),
+}
+"""What to do about errors of the system, by their numbers."""
+
 ALIASES = {"embed": "language"}
 """Other names of commands."""
 
@@ -99,7 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         remedy = "rename the file or folder"
         print(f"error: {subject}: expected names in UTF-8, found other bytes; {remedy}", file=sys.stderr)
     except OSError as error:  # such as a full disk or a folder without permission
-        print(f"error: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
+        remedy = _REMEDIES.get(error.errno or 0, "")
+        print(f"error: {error.filename or 'output'}: {error.strerror or error}{remedy}", file=sys.stderr)
     return 1
 
 

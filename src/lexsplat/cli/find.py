@@ -13,6 +13,7 @@ from lexsplat.cli.options import (
     check_threshold,
     open_scene,
     print_json,
+    print_rests_on,
 )
 
 
@@ -59,7 +60,7 @@ class Find:
             return
         for answer in answers["phrases"]:
             _print_answer(answer)
-        print(f"relative to {answers['rests_on']}")
+        print_rests_on(scene, answers["rests_on"])
 
 
 def _print_answer(answer: dict[str, Any]) -> None:

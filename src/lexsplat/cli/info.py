@@ -21,14 +21,14 @@ class Info:
 
     def run(self) -> None:
         """Print the facts."""
-        from lexsplat.scenes.facts import scene_facts
+        from lexsplat.scenes.facts import NO_SEGMENTS, scene_facts
 
         facts = scene_facts(open_folder(self.scene))
         if self.json:
             print_json(facts)
             return
         if facts["method"] is not None and facts["segments"] is None:
-            facts["segments"] = "none; the method averaged makes them, for answers by whole things"
+            facts["segments"] = f"none: {NO_SEGMENTS}"
         chosen = facts.pop("chosen_views")
         if chosen is not None:
             facts["capture"] = (

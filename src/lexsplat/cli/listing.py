@@ -53,6 +53,8 @@ class List:
             raise ValueError("give --csv or --json, not both")
         if self.output is not None and not self.images:
             raise ValueError("--output needs --images")
+        if self.output is not None and self.output.suffix.lower() != ".png":
+            raise ValueError(f"--output must be a .png file, got {self.output}")
 
     def run(self) -> None:
         """List and print."""
@@ -66,6 +68,8 @@ class List:
             print_json(document)
         elif self.csv:
             _print_table(document["objects"])
+            for line in filter(None, (document["note"], document["picture"])):
+                print(line, file=sys.stderr)  # standard output is the table
         else:
             _print_objects(document)
 

@@ -89,6 +89,15 @@ def confirmed(question: str) -> bool:
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
+def print_rests_on(scene: Scene, rests_on: str) -> None:
+    """Print what an answer rests on, and how to get segments where they are asked for and there are none."""
+    print(f"relative to {rests_on}")
+    if scene.query.form == "segment" and scene.field.segments is None:
+        from lexsplat.scenes.facts import NO_SEGMENTS
+
+        print(f"no segments: {NO_SEGMENTS}")
+
+
 def print_json(document: Any) -> None:
     """Print one JSON document on standard output."""
     print(json.dumps(document, indent=2, ensure_ascii=False))

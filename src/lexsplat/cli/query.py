@@ -15,6 +15,7 @@ from lexsplat.cli.options import (
     check_threshold,
     open_scene,
     print_json,
+    print_rests_on,
 )
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ class Query:
             )
             if answer["note"]:
                 print(f"  note: {answer['note']}")
-        print(f"relative to {answers['rests_on']}")
+        print_rests_on(scene, answers["rests_on"])
         if folder:
             print(f"images in {folder}")
 

@@ -12,7 +12,7 @@ from lexsplat.runtime.lazy import at_first_use
 
 if TYPE_CHECKING:
     from lexsplat.features.cache import FeatureMap, FeatureMaps
-    from lexsplat.features.external import external_identity, load_external_features
+    from lexsplat.features.external import check_external_features, external_identity, load_external_features
     from lexsplat.features.extraction import extract_features, load_level_maps
     from lexsplat.features.settings import FeatureConfig
     from lexsplat.features.text import TextCache
@@ -22,6 +22,7 @@ __all__ = [
     "FeatureMap",
     "FeatureMaps",
     "TextCache",
+    "check_external_features",
     "external_identity",
     "extract_features",
     "load_external_features",
@@ -32,7 +33,7 @@ __getattr__ = at_first_use(
     "lexsplat.features",
     {
         "cache": ("FeatureMap", "FeatureMaps"),
-        "external": ("external_identity", "load_external_features"),
+        "external": ("check_external_features", "external_identity", "load_external_features"),
         "extraction": ("extract_features", "load_level_maps"),
         "settings": ("FeatureConfig",),
         "text": ("TextCache",),

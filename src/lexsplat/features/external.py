@@ -60,8 +60,6 @@ def load_external_features(
         MemoryBudgetError: On access, if a map does not fit.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise FileFormatError(folder, expected="a folder with one array per view", found="no folder")
     sources = external_sources(folder, capture)
     depth: dict[str, int] = {}
 
@@ -77,7 +75,7 @@ def load_external_features(
                 remedy="give the encoder of the features with --clip",
             )
         if depth and dims != depth:
-            raise FileFormatError(path, expected=f"features of depth {depth}", found=f"{dims}")
+            raise _wrong(path, f"features of depth {depth}", dims, "give features of one encoder")
         depth.update(dims)
         if not allow_holes and not bool(found.clip.any(-1).all()):
             raise FileFormatError(
@@ -91,12 +89,33 @@ def load_external_features(
     return FeatureMaps(list(sources), load, memory // 4)
 
 
+def check_external_features(folder: Path, capture: Capture) -> None:
+    """Refuse what the headers of .npy files tell, before anything that takes time; values are checked on access.
+
+    Args:
+        folder: Folder of the arrays (`load_external_features`).
+        capture: Every view must have an array; those of training views are opened. Its cameras are not read.
+
+    Raises:
+        FileFormatError: If a view has no array, or one has a wrong shape or type.
+    """
+    sources = external_sources(folder, capture)
+    for name in capture.train_names:
+        reading, path = _Reading(capture.views[name], budget.DEFAULT_MEMORY), sources[name]
+        if path.name.endswith("_f.npy"):
+            reading.open_segments(path)
+        elif path.suffix == ".npy":
+            reading.check_aspect(_open_npy(path).shape, path)
+
+
 def external_sources(folder: Path, capture: Capture) -> dict[str, Path]:
     """The file of each view by its name; of a pair, the file of features.
 
     Raises:
-        FileFormatError: If a view has no file.
+        FileFormatError: If there is no folder, a view has no file, or one of a pair is missing.
     """
+    if not folder.is_dir():
+        raise _wrong(folder, "a folder with one array per view", "no folder", "check the path")
     return {name: _source(folder, view.stem) for name, view in capture.views.items()}
 
 
@@ -119,6 +138,9 @@ def _source(folder: Path, stem: str) -> Path:
     candidates = [folder / f"{stem}{ending}" for ending in (".npy", ".safetensors", "_f.npy")]
     for path in candidates:
         if path.is_file():
+            if path.name.endswith("_f.npy") and not _segments_of(path).is_file():
+                remedy = "put the segments of every pixel beside their features"
+                raise _wrong(_segments_of(path), f"the segments of {path.name}", "no such file", remedy)
             return path
     for ending in PICKLES:
         if (folder / f"{stem}{ending}").exists():
@@ -176,16 +198,9 @@ class _Reading:
 
     def segments(self, path: Path) -> FeatureMap:
         """The map of one feature per segment and the segments of every pixel."""
-        features, pixels = _open_npy(path), _segments_of(path)
-        if features.ndim != 2:
-            raise _wrong(path, "[n, D]", list(features.shape))
-        numbers = _open_npy(pixels)
-        if numbers.ndim not in (2, 3):
-            raise _wrong(pixels, "[h, w] or [L, h, w]", list(numbers.shape))
-        if 0 in numbers.shape:
-            raise _wrong(pixels, "segment ids", "an empty array")
-        rows, columns = self._cells((*numbers.shape[-2:], features.shape[1]), 0, pixels)
-        index = _segment_numbers(numbers[..., rows[:, None], columns], len(features), pixels)
+        features, numbers = self.open_segments(path)
+        rows, columns = self._cells((*numbers.shape[-2:], features.shape[1]), 0, _segments_of(path))
+        index = _segment_numbers(numbers[..., rows[:, None], columns], len(features), _segments_of(path))
         unit = _unit(np.array(features)[None], path)[0].numpy()
         # Segment -1 selects the zero at the end.
         padded = np.concatenate([unit, np.zeros((1, unit.shape[1]), np.float32)])
@@ -194,27 +209,51 @@ class _Reading:
             total[row] = padded[index[:, row]].sum(0)
         return FeatureMap(_unit(total, path))
 
+    def open_segments(self, path: Path) -> tuple[NDArray, NDArray]:
+        """Features of segments ``[n, D]``, and the segments of the pixels ``[h, w]`` or ``[L, h, w]``, mapped.
+
+        Raises:
+            FileFormatError: If one has another shape, or the pixels not the photo's aspect.
+        """
+        features, pixels = _open_npy(path), _segments_of(path)
+        if features.ndim != 2 or 0 in features.shape:
+            raise _wrong(path, "features of segments [n, D]", list(features.shape))
+        numbers = _open_npy(pixels)
+        if numbers.ndim not in (2, 3) or 0 in numbers.shape:
+            raise _wrong(pixels, "segment ids [h, w] or [levels, h, w]", list(numbers.shape))
+        self.check_aspect((*numbers.shape[-2:], features.shape[1]), pixels)
+        return features, numbers
+
+    def check_aspect(self, shape: tuple[int, ...], path: Path) -> None:
+        """Refuse an array ``[h, w, D]`` of another shape, or without the photo's aspect.
+
+        Raises:
+            FileFormatError: If it is one.
+        """
+        if len(shape) != 3 or 0 in shape:
+            raise _wrong(path, "features [h, w, D]", list(shape))
+        height, width, _ = shape
+        photo_width, photo_height = self.view.capture_size
+        # Numbers of cells are rounded: either side may be off by one.
+        if abs(height * photo_width - width * photo_height) >= photo_width + photo_height:
+            raise _wrong(
+                path,
+                f"an array of the photo's aspect, {photo_width}x{photo_height}",
+                f"{width}x{height}",
+                "give features of the whole photo",
+            )
+
     def _cells(
         self, shape: tuple[int, ...], itemsize: int, path: Path
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows and columns to read of an array ``[h, w, D]``.
 
         Raises:
-            FileFormatError: If it has another shape, or not the photo's aspect.
+            FileFormatError: As `check_aspect`.
             MemoryBudgetError: If the map does not fit.
         """
-        if len(shape) != 3 or 0 in shape:
-            raise _wrong(path, "features [h, w, D]", list(shape))
+        self.check_aspect(shape, path)
         height, width, depth = shape
-        photo_width, photo_height = self.view.capture_size
-        # Numbers of cells are rounded: either side may be off by one.
-        if abs(height * photo_width - width * photo_height) >= photo_width + photo_height:
-            raise FileFormatError(
-                path,
-                expected=f"[h, w, D] of the photo's aspect, {photo_width}x{photo_height}",
-                found=f"{width}x{height}",
-                remedy="give features of the whole photo",
-            )
         rows, columns = min(height, self.view.camera.height), min(width, self.view.camera.width)
         # The map, and its source or its norms and a row.
         need = rows * columns * (depth * (4 + itemsize) + 16) + (16 << 20)
@@ -256,8 +295,10 @@ _UNREADABLE = (
 """Types that numpy raises on damaged arrays."""
 
 
-def _wrong(path: Path, expected: str, found: object) -> FileFormatError:
-    return FileFormatError(path, expected=expected, found=str(found)[:200])
+def _wrong(
+    path: Path, expected: str, found: object, remedy: str = "write it again (docs/captures.md has the layout)"
+) -> FileFormatError:
+    return FileFormatError(path, expected=expected, found=str(found)[:200], remedy=remedy)
 
 
 def _unit(array: NDArray, path: Path) -> torch.Tensor:

@@ -8,8 +8,10 @@ from __future__ import annotations
 import errno
 import hashlib
 import logging
+import os
 import shutil
 from collections.abc import Collection, Iterator
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +53,8 @@ def model_folder(name: str, tower: str) -> Path:
         A folder with a configuration, weights, and for "clip" a tokenizer.
 
     Raises:
-        ModelError: If the folder lacks one of them, or the model is neither in the hub's cache nor can be downloaded.
+        ModelError: If the folder lacks one of them or may not be read, or the model is neither in the hub's cache nor
+            can be downloaded.
     """
     if present_name(name) == "bundled":
         return BUNDLED_ENCODERS / tower
@@ -60,18 +63,27 @@ def model_folder(name: str, tower: str) -> Path:
         raise ModelError("model", expected=expected, found="nothing", remedy=_choices(tower))
     folder = Path(name).expanduser()
     if folder.is_dir():
+        _check_readable(folder, os.R_OK | os.X_OK)
         lacking = missing_part(folder, tower)
         if lacking:
+            if "tokenizer" in lacking:
+                _check_has_text(folder, name)
             raise ModelError(
                 name,
                 expected=f"a model folder with {lacking}",
                 found=_contents(folder),
                 remedy=_remedy_for(lacking, name, tower),
             )
+        for path in loaded_files(folder, tower):
+            _check_readable(path)
         return folder
     if folder.exists():
-        remedy = f"give its folder: --{tower} {folder.parent}"
+        is_model = (folder.parent / "config.json").is_file()
+        remedy = f"give its folder: --{tower} {folder.parent}" if is_model else _choices(tower)
         raise ModelError(name, expected="a model folder", found="a file", remedy=remedy)
+    if "/" not in name and get_close_matches(name.lower(), ("bundled", "embedded")):
+        expected, remedy = "a model folder, or a name OWNER/NAME", f"use `--{tower} bundled`"
+        raise ModelError(name, expected=expected, found="no such folder", remedy=remedy)
     if len(folder.parts) > 2 or name.startswith((".", "~")):  # names on the hub are OWNER/NAME
         expected = "a model folder, or a name OWNER/NAME"
         raise ModelError(name, expected=expected, found="no such folder", remedy=_choices(tower))
@@ -157,6 +169,30 @@ def content_hash(folder: Path, tower: str) -> str:
             while block := stream.read(1 << 20):
                 digest.update(block)
     return digest.hexdigest()
+
+
+def _check_readable(path: Path, mode: int = os.R_OK) -> None:
+    """Refuse a file or folder without permission.
+
+    Raises:
+        ModelError: If there is none.
+    """
+    if not os.access(path, mode):
+        remedy = f"allow it: chmod u+r{'x' if mode & os.X_OK else ''} {path}"
+        raise ModelError(path, expected="permission to read it", found="none", remedy=remedy)
+
+
+def _check_has_text(folder: Path, name: str) -> None:
+    """Refuse an encoder of photos alone where an image-text model is needed: a tokenizer would not help it.
+
+    Raises:
+        ModelError: If its configuration has no text tower.
+    """
+    config = read_config(folder / "config.json")
+    if "model_type" in config and not any(key.startswith("text_config") for key in config):
+        found = f"a {config['model_type']!r} model without a text tower"
+        expected = "an image-text model such as CLIP"
+        raise ModelError(name, expected=expected, found=found, remedy=_choices("clip"))
 
 
 def _contents(folder: Path) -> str:

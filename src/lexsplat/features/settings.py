@@ -30,8 +30,8 @@ class FeatureConfig:
         crop_strides: Grid: distance between crops of each size, as a fraction of their side.
         crop_tokens: Grid: which embeddings of a crop are used. "class": the image-level embedding, placed at the
             center of the crop (the paper). "patch": patch-level embeddings as in MaskCLIP, each placed at its patch;
-            needs a model of CLIP's own architecture. "both": both. None is "class", and "both" for the bundled
-            encoders.
+            needs a model of CLIP's own architecture. "both": both. None is "class"; it is "both" for the bundled
+            encoders, and on a CPU for models of CLIP's architecture.
         random_crops: Random: crops per view, divided evenly among the sizes.
         random_levels: Random: number of sizes.
         random_sizes: Random: smallest and largest side as fractions of the image's short side.

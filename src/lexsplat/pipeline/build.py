@@ -18,7 +18,7 @@ from torch import Tensor
 from lexsplat.captures import Capture, View, load_annotations
 from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook
-from lexsplat.features import FeatureMaps, external_identity, load_external_features
+from lexsplat.features import FeatureMaps, check_external_features, external_identity
 from lexsplat.geometry.world import World, parse_vector
 from lexsplat.language.code_maps import MaskedCodeMaps, mark_masked_cells
 from lexsplat.language.methods import METHODS, FitRun, TrainingViews
@@ -93,6 +93,7 @@ def build(
     folder = SceneFolder(Path(output))
     folder.refuse_foreign_files()
     is_new = not folder.root.exists()
+    above = [place for place in folder.root.absolute().parents if not place.exists()]
     given = (source,) if source is not None and source.is_dir() else ()  # of a video workers get the frames
     with open_workers(config.workers, given) as workers, folder.locked(), warnings_once():
         try:
@@ -118,15 +119,15 @@ def build(
             capture = capture.downscaled(config.downscale or 1.0)
             _check_photos(capture, parse_bytes(config.memory))
             if config.features_from is not None:
-                load_external_features(config.features_from, capture)
+                check_external_features(config.features_from, capture)
             builder = _Builder(capture, folder, config, device, listener, splats)
             builder.encoders, builder.workers = checked, workers
             SharedFolder.forget_marks(folder.root / "checkpoints")
             workers.require((capture.root,))
             return builder.run(until)
-        except (CaptureError, FileFormatError, ModelError, MemoryBudgetError):
+        except (CaptureError, FileFormatError, ModelError, MemoryBudgetError, OSError):
             if is_new:  # the lock is held, so nobody else uses the folder
-                folder.withdraw()
+                folder.withdraw(above)
             raise
 
 

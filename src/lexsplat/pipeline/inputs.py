@@ -35,6 +35,7 @@ from lexsplat.captures.sfm.preparation import (
     upright_size,
 )
 from lexsplat.captures.splits import choose_test_names
+from lexsplat.features import check_external_features
 from lexsplat.geometry.cameras import Camera
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import CaptureError, SceneFolderError
@@ -144,13 +145,14 @@ def preview_capture(
 def survey_photos(
     source: Path, output: Path, config: BuildConfig, test_names: list[str] | None
 ) -> PhotoSurvey | None:
-    """Look at photos without cameras and their ground truth (`preview_capture`); None for a capture with cameras.
+    """Look at photos without cameras, their ground truth and features of another program; None if there are cameras.
 
     Masks are checked by structure from motion before it searches features.
 
     Raises:
         CaptureError: As `preview_capture`, if there is neither a camera nor a photo, or if ground truth belongs to no
             photo or does not fit it.
+        FileFormatError: If features of another program do not fit the photos.
     """
     check_capture(source)
     if not is_photo_folder(source):
@@ -159,6 +161,8 @@ def survey_photos(
     if capture is None:
         return PhotoSurvey(config.frames, _VIDEO_SIZE)
     load_annotations(capture)
+    if config.features_from is not None:
+        check_external_features(config.features_from, capture)
     return PhotoSurvey(len(capture.train_names), _largest(capture))
 
 
@@ -226,6 +230,7 @@ def _registered_images(
     facts = {
         "registered": len(found.registered),
         "unregistered": list(found.unregistered),
+        "mapper": found.mapper,
         "images": images,
     }
     folder.finish("poses", key, time.perf_counter() - start, **facts)

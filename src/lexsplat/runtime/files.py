@@ -30,7 +30,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """A temporary path beside ``path`` that replaces it when the block ends without an error.
 
     Readers see the old file or the new one, never a part. The data reach the disk before the name changes. Missing
-    folders are created. Threads and processes may write the same file at once; the last one wins.
+    folders are created. Threads and processes may write the same file at once; the last one wins. Errors of the
+    system name ``path``.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{get_ident()}.tmp")
@@ -39,6 +40,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename == str(temporary):
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

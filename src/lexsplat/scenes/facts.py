@@ -8,6 +8,12 @@ from typing import Any
 from lexsplat.geometry.world import world_of
 from lexsplat.scenes.folder import SceneFolder
 
+NO_SEGMENTS = (
+    "single Gaussians answer; lexsplat language CAPTURE --output SCENE, with the options of the build, adds segments"
+    " (method averaged)"
+)
+"""What it means that a scene has no segments, and how to get them."""
+
 
 def is_of_chosen_views(record: Mapping[str, Any]) -> bool:
     """Whether the views of a scene were chosen from splats that came without a capture."""

@@ -19,7 +19,7 @@ import contextlib
 import dataclasses
 import io
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -231,8 +231,12 @@ class SceneFolder:
         with locked(self.root, refusal):
             yield
 
-    def withdraw(self) -> None:
-        """Remove the record of a build that ended before its first stage; a folder with other files stays."""
+    def withdraw(self, made: Iterable[Path] = ()) -> None:
+        """Remove the record of a build that ended before its first stage; a folder with other files stays.
+
+        Args:
+            made: Folders above it that the build made, the nearest first; they go if they are empty.
+        """
         files = [path for path in self.root.rglob("*") if not path.is_dir()]
         begun = {self.root / name for name in (".lock", "scene.json", "cameras.json")}
         if self.record["stages"] or not set(files) <= begun:
@@ -240,7 +244,7 @@ class SceneFolder:
         for path in files:
             path.unlink(missing_ok=True)
         folders = sorted(path for path in self.root.rglob("*") if path.is_dir())
-        for path in [*reversed(folders), self.root]:
+        for path in [*reversed(folders), self.root, *made]:
             with contextlib.suppress(OSError):
                 path.rmdir()
 

@@ -20,6 +20,7 @@ from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.answers import rests_on
+from lexsplat.scenes.facts import NO_SEGMENTS
 from lexsplat.scenes.formats.tables import colors_of
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ _LINE = 16
 _COLUMNS = 5
 _MARGIN = 0.35
 """Space around an object in its thumbnail, as a share of its size."""
-NO_SEGMENTS = "the scene has no segments: objects are found by single words; lexsplat language adds segments"
 
 
 def read_vocabulary(path: Path) -> list[str]:
@@ -54,7 +54,9 @@ def read_vocabulary(path: Path) -> list[str]:
         with open(path, "rb") as file:
             content = file.read(_MAX_BYTES + 1)
     except OSError as error:
-        raise refused("a readable file", error.strerror or type(error).__name__) from error
+        known = {FileNotFoundError: "no such file", IsADirectoryError: "a folder"}
+        found = known.get(type(error)) or error.strerror or type(error).__name__
+        raise refused("a readable file", found) from error
     if len(content) > _MAX_BYTES:
         raise refused(f"at most {_MAX_BYTES:,} bytes", "more")
     try:
@@ -65,9 +67,12 @@ def read_vocabulary(path: Path) -> list[str]:
     phrases = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
     if not phrases:
         raise refused("at least one name", "none")
-    strange = next((line for line in phrases if len(line) > _MAX_LENGTH or not line.isprintable()), None)
-    if strange is not None:
-        raise refused(f"names of at most {_MAX_LENGTH} characters", repr(strange)[:60])
+    for line in phrases:
+        if not line.isprintable():
+            raise refused("names of printable characters", repr(line[:30]))
+        if len(line) > _MAX_LENGTH:
+            found = f"one of {len(line):,}, {line[:20] + '...'!r}"
+            raise refused(f"names of at most {_MAX_LENGTH} characters", found)
     if len(phrases) > MAX_WORDS:
         raise refused(f"at most {MAX_WORDS:,} names", f"{len(phrases):,}")
     return phrases
@@ -150,7 +155,7 @@ def list_document(
         "rests_on": rests_on(scene),
         **scene.world.to_json(),
         "words": len(vocabulary) or len(default_vocabulary(scene.clip)),
-        "note": "" if scene.field.segments else NO_SEGMENTS,
+        "note": "" if scene.field.segments else f"no segments: each word is looked for; {NO_SEGMENTS}",
         "picture": None if picture is None else str(picture),
         "objects": [_entry(scene, thing) for thing in things],
     }

@@ -53,11 +53,13 @@ class Attempt:
         mapper: The mapper.
         model: The model, without mis-registered photos.
         models: Number of models that could not be joined.
+        all_pairs: Whether photos left over by sequential matching had been matched with all others.
     """
 
     mapper: Mapper
     model: pycolmap.Reconstruction
     models: int
+    all_pairs: bool = False
 
     @property
     def rank(self) -> tuple[int, float]:

@@ -13,7 +13,7 @@ import contextlib
 import itertools
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -85,6 +85,7 @@ class PhotoPoses:
         points: Number of triangulated points.
         models: Number of models that could not be joined; the largest is kept.
         mapper: How the model was found.
+        all_pairs: Whether photos left over by sequential matching were matched with all others for it.
         notes: Remarks for the user, one line each.
     """
 
@@ -95,6 +96,7 @@ class PhotoPoses:
     points: int
     models: int
     mapper: Mapper = "incremental"
+    all_pairs: bool = False
     notes: tuple[str, ...] = ()
 
     @property
@@ -109,8 +111,9 @@ class PhotoPoses:
         line = f"{len(self.registered)} of {total} photos registered, {self.points:,} points"
         if self.models > 1:
             line = f"{line}, the largest of {self.models} models"
-        if self.mapper != "incremental":
-            line = f'{line}, found by the mapper "{self.mapper}"'
+        line = f'{line}, found by the mapper "{self.mapper}"'
+        if self.all_pairs:
+            line = f"{line} after all pairs of those left over were matched"
         return line if not self.unregistered else f"{line}; unregistered: {', '.join(self.unregistered)}"
 
 
@@ -173,7 +176,15 @@ def poses_from_photos(
     listener(Event(STAGE, total, total, {"registered": len(registered), "photos": len(names)}))
     points = best.model.num_points3D()
     return PhotoPoses(
-        output, photos.images, registered, unregistered, points, best.models, best.mapper, photos.notes
+        output,
+        photos.images,
+        registered,
+        unregistered,
+        points,
+        best.models,
+        best.mapper,
+        best.all_pairs,
+        photos.notes,
     )
 
 
@@ -194,7 +205,7 @@ def _best_attempt(
     """
     from lexsplat.captures.sfm import mapping
 
-    names, best = photos.names, None
+    names, best, leftover = photos.names, None, False
     every_pair = config.pairs != "auto" or config.compares_all(len(names))
     mappers: tuple[mapping.Mapper, ...] = ("incremental", "small angles", "global")
     for mapper in sorted(mappers, key=lambda name: name != config.mapper):
@@ -204,13 +215,13 @@ def _best_attempt(
         ):
             continue
         check_mapping(database, memory)
-        found = _attempt(database, photos, mapper, seed, report)
+        found = _attempt(database, photos, mapper, seed, report, all_pairs=leftover)
         missing = mapping.unregistered(names, found)
         if missing and not every_pair:
-            every_pair = True
+            every_pair = leftover = True
             mapping.match_leftover(database, names, missing, seed, memory)
             check_mapping(database, memory)
-            found = _attempt(database, photos, mapper, seed, report) or found
+            found = _attempt(database, photos, mapper, seed, report, all_pairs=True) or found
         best = max(filter(None, (best, found)), key=lambda attempt: attempt.rank, default=None)
         if mapping.matched(database).isdisjoint(mapping.unregistered(names, best)):
             break
@@ -218,12 +229,19 @@ def _best_attempt(
 
 
 def _attempt(
-    database: Path, photos: PreparedPhotos, mapper: Mapper, seed: int, report: Callable[[int], None]
+    database: Path,
+    photos: PreparedPhotos,
+    mapper: Mapper,
+    seed: int,
+    report: Callable[[int], None],
+    *,
+    all_pairs: bool,
 ) -> Attempt | None:
     from lexsplat.captures.sfm.mapping import map_photos
 
     done = itertools.count(len(photos.names) + 2)
-    return map_photos(database, photos, mapper, seed, lambda: report(next(done)))
+    found = map_photos(database, photos, mapper, seed, lambda: report(next(done)))
+    return None if found is None else replace(found, all_pairs=all_pairs)
 
 
 def _check_mapper(config: PoseConfig) -> None:

@@ -40,7 +40,7 @@ MOST_SHARDS = 64
 """Shards of a capture at most: each sends as many bytes as the sums have."""
 
 MAX_STORE = 1 << 30
-"""Bytes that the sums may take at most, however much memory there is."""
+"""Bytes that the sums may take on the host at most, however much memory there is."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,9 @@ def average_features(
         feature_maps: Dense features by view name; cells whose CLIP feature is zero are ignored.
         config: Settings.
         valid: Valid pixels of a view.
-        memory: Host memory in bytes, a quarter of which the sums may take (at most `MAX_STORE`). If they need more,
-            the views are traversed several times, for a range of feature dimensions each, and the means are kept in
-            a file. The result does not depend on it.
+        memory: Host memory in bytes, which bounds the sums (`sums_bound`). If they need more, the views are traversed
+            several times, for a range of feature dimensions each. Means that need more than the bound of the host are
+            kept in a file. The result does not depend on it.
         scratch: Folder for that file; None takes the system's.
         workers: Where the sums of each shard of views are made. The result does not depend on it.
         listener: Receives events of stage "average".
@@ -119,9 +119,9 @@ def average_features(
     dino = feature_maps[names[0]].dino if config.dino else None
     with_dino = 0 if dino is None else dino.shape[-1]
     dimensions = feature_maps[names[0]].clip.shape[-1] + with_dino
-    share = max(1, min(MAX_STORE, memory // 4))
-    ranges = list(_ranges(dimensions, count, share))
-    means = _store(count, dimensions, share, scratch)
+    device = gaussians.device if not workers.distributed else torch.device("cpu")
+    ranges = list(_ranges(dimensions, count, sums_bound(device, memory)))
+    means = _store(count, dimensions, sums_bound(torch.device("cpu"), memory), scratch)
     shards = view_shards(names)
     seen = _is_seen(workers, scratch)
     shared = _Averaging(gaussians, dict(cameras), feature_maps if seen else {}, config, valid, with_dino)
@@ -153,6 +153,20 @@ def _is_seen(workers: Workers, folder: Path | None) -> bool:
         return True
     with SharedFolder.offered(folder) as offered:
         return workers.see(offered)
+
+
+def sums_bound(device: torch.device, memory: int) -> int:
+    """Bytes that the sums may take: half of what is free on their GPU; on a CPU a quarter of the host memory.
+
+    Sums of workers travel through the host, so that its bound holds for them too.
+
+    Args:
+        device: Device of the sums.
+        memory: Host memory in bytes.
+    """
+    if device.type == "cuda":
+        return max(1, torch.cuda.mem_get_info(device)[0] // 2)
+    return max(1, min(MAX_STORE, memory // 4))
 
 
 _Shard = tuple[tuple[str, ...], range, int, Mapping[str, FeatureMap] | None]
