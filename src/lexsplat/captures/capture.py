@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from lexsplat.captures.images.bands import FilledRows, MaskRows, Rows, resized
 from lexsplat.captures.images.reading import PhotoRows, image_size, read_mask, resize_nearest, sizes_agree
-from lexsplat.captures.images.undistortion import Lens, RemappedRows, undistort, undistort_nearest
+from lexsplat.captures.images.undistortion import (
+    Lens,
+    RemappedRows,
+    nearest_pixels,
+    undistort,
+    undistort_nearest,
+)
 from lexsplat.geometry.cameras import Camera, camera_extent
 from lexsplat.runtime.errors import CaptureError
 
@@ -119,6 +125,19 @@ class View:
             )
         return undistort_nearest(mask, self.lens, self._checked_size(size))
 
+    def undistort_labels(
+        self, labels: NDArray[np.integer], subject: Path, size: tuple[int, int]
+    ) -> NDArray[np.integer]:
+        """A map of numbers ``[h, w]`` drawn on the photo, at a width and height, as `load_mask` undistorts a mask.
+
+        Raises:
+            CaptureError: If its aspect is not the photo's.
+        """
+        self._check_aspect(subject, (labels.shape[1], labels.shape[0]))
+        if self._is_undistorted(labels) or not self.lens.distorts:
+            return resize_nearest(labels, self._checked_size(size))
+        return labels[nearest_pixels(self.lens, self._checked_size(size), labels.shape)]
+
     def load_valid(self, size: tuple[int, int] | None = None) -> NDArray[np.bool_] | None:
         """Pixels that losses use, ``[H, W]`` bool at the camera's size, or None for all.
 
@@ -155,7 +174,7 @@ class View:
         """
         self._check_aspect(path, image_size(path))
 
-    def _is_undistorted(self, mask: NDArray[np.bool_]) -> bool:
+    def _is_undistorted(self, mask: NDArray) -> bool:
         """Whether a mask was drawn on the undistorted photo: it has exactly that size, and not the photo's."""
         found = (mask.shape[1], mask.shape[0])
         return found == self.capture_size != (self.lens.width, self.lens.height)

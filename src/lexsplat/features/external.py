@@ -105,7 +105,7 @@ def check_external_features(folder: Path, capture: Capture) -> None:
         if path.name.endswith("_f.npy"):
             reading.open_segments(path)
         elif path.suffix == ".npy":
-            reading.check_aspect(_open_npy(path).shape, path)
+            reading.check_aspect(open_npy(path).shape, path)
 
 
 def external_sources(folder: Path, capture: Capture) -> dict[str, Path]:
@@ -167,7 +167,7 @@ class _Reading:
     def arrays(self, path: Path) -> FeatureMap:
         """``[h, w, D]`` from .npy or safetensors."""
         if path.suffix == ".npy":
-            array = _open_npy(path)
+            array = open_npy(path)
             itemsize = 0 if array.dtype == np.float32 else array.itemsize
             rows, columns = self._cells(array.shape, itemsize, path)
             return FeatureMap(_unit(array[rows[:, None], columns], path))
@@ -200,7 +200,7 @@ class _Reading:
         """The map of one feature per segment and the segments of every pixel."""
         features, numbers = self.open_segments(path)
         rows, columns = self._cells((*numbers.shape[-2:], features.shape[1]), 0, _segments_of(path))
-        index = _segment_numbers(numbers[..., rows[:, None], columns], len(features), _segments_of(path))
+        index = segment_numbers(numbers[..., rows[:, None], columns], _segments_of(path), len(features))
         unit = _unit(np.array(features)[None], path)[0].numpy()
         # Segment -1 selects the zero at the end.
         padded = np.concatenate([unit, np.zeros((1, unit.shape[1]), np.float32)])
@@ -215,10 +215,10 @@ class _Reading:
         Raises:
             FileFormatError: If one has another shape, or the pixels not the photo's aspect.
         """
-        features, pixels = _open_npy(path), _segments_of(path)
+        features, pixels = open_npy(path), _segments_of(path)
         if features.ndim != 2 or 0 in features.shape:
             raise _wrong(path, "features of segments [n, D]", list(features.shape))
-        numbers = _open_npy(pixels)
+        numbers = open_npy(pixels)
         if numbers.ndim not in (2, 3) or 0 in numbers.shape:
             raise _wrong(pixels, "segment ids [h, w] or [levels, h, w]", list(numbers.shape))
         self.check_aspect((*numbers.shape[-2:], features.shape[1]), pixels)
@@ -267,8 +267,12 @@ def _centers(count: int, length: int) -> NDArray[np.intp]:
     return ((2 * np.arange(count) + 1) * length) // (2 * count)
 
 
-def _segment_numbers(segments: NDArray, count: int, path: Path) -> NDArray[np.int64]:
-    """Segment ids ``[L, h, w]`` from ``[h, w]`` or ``[L, h, w]``: integers from -1 to ``count`` - 1."""
+def segment_numbers(segments: NDArray, path: Path, count: int = 1 << 31) -> NDArray[np.int64]:
+    """Segment ids ``[L, h, w]`` from ``[h, w]`` or ``[L, h, w]``: integers from -1 to ``count`` - 1.
+
+    Raises:
+        FileFormatError: If they are others.
+    """
     if not np.isfinite(segments).all() or np.abs(segments.astype(np.float64)).max() > 2**31:
         raise _wrong(path, "integer segment ids", "NaN, infinity or values beyond 2^31")
     index = segments.astype(np.int64)
@@ -277,8 +281,12 @@ def _segment_numbers(segments: NDArray, count: int, path: Path) -> NDArray[np.in
     return index.reshape(-1, *index.shape[-2:])
 
 
-def _open_npy(path: Path) -> NDArray:
-    """An array of numbers, memory-mapped: a damaged header cannot allocate more than the file holds."""
+def open_npy(path: Path) -> NDArray:
+    """An array of numbers, memory-mapped: a damaged header cannot allocate more than the file holds.
+
+    Raises:
+        FileFormatError: If it is no such array.
+    """
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except _UNREADABLE as error:

@@ -172,6 +172,20 @@ def encoded_size(capture_size: tuple[int, int], config: FeatureConfig) -> tuple[
     return max(1, round(capture_size[0] * factor)), max(1, round(capture_size[1] * factor))
 
 
+def size_of_map(capture_size: tuple[int, int], config: FeatureConfig) -> tuple[int, int]:
+    """Width and height of a feature map in cells."""
+    width, height = capture_size
+    cells = config.map_cells / min(width, height) * _strip_factor(width, height)
+    return max(1, round(width * cells)), max(1, round(height * cells))
+
+
+def pixels_hash(view: View, size: tuple[int, int]) -> str:
+    """Hash of everything the pixels of `View.load_image` depend on: file, lens, background, size and mask."""
+    lens = dataclasses.asdict(view.lens)
+    masked = [] if view.ignore_path is None else [file_hash(view.ignore_path, 16)]
+    return hash_of(file_hash(view.image_path, 16), lens, list(view.background), size, *masked)
+
+
 @dataclass(frozen=True)
 class _Entry:
     """Cache files, image size and map size of a view."""
@@ -191,14 +205,8 @@ class _Entry:
         config: FeatureConfig,
         cache_dir: Path,
     ) -> _Entry:
-        width, height = view.capture_size
-        image_size = encoded_size(view.capture_size, config)
-        cells = config.map_cells / min(width, height) * _strip_factor(width, height)
-        map_size = max(1, round(width * cells)), max(1, round(height * cells))
-        # Everything the pixels depend on: file, lens, background, size and mask.
-        lens = dataclasses.asdict(view.lens)
-        masked = [] if view.ignore_path is None else [file_hash(view.ignore_path, 16)]
-        pixels = hash_of(file_hash(view.image_path, 16), lens, list(view.background), image_size, *masked)
+        image_size, map_size = encoded_size(view.capture_size, config), size_of_map(view.capture_size, config)
+        pixels = pixels_hash(view, image_size)
         settings = dataclasses.asdict(config)
         crops = {
             name: settings[name]

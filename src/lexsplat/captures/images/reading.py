@@ -206,8 +206,8 @@ def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
     return values > half
 
 
-def resize_nearest(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Resample a mask ``[H, W]`` to ``(width, height)`` by nearest neighbor."""
+def resize_nearest(mask: NDArray, size: tuple[int, int]) -> NDArray:
+    """Resample a mask or other map ``[H, W]`` to ``(width, height)`` by nearest neighbor."""
     rows = ((np.arange(size[1]) + 0.5) * mask.shape[0] / size[1]).astype(np.int64)
     columns = ((np.arange(size[0]) + 0.5) * mask.shape[1] / size[0]).astype(np.int64)
     return mask[rows[:, None], columns[None, :]]

@@ -155,6 +155,24 @@ def undistort_nearest(mask: NDArray[np.bool_], lens: Lens, size: tuple[int, int]
     return _remap(mask[..., None].astype(np.float32), grid, "nearest")[..., 0] > 0.5
 
 
+def nearest_pixels(
+    lens: Lens, size: tuple[int, int], shape: tuple[int, int]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns ``[h, w]`` of a map of ``shape`` drawn on a photo, at the pixels of its pinhole image.
+
+    Args:
+        lens: The lens.
+        size: Width and height of the pinhole image in pixels.
+        shape: Height and width of the map.
+    """
+    grid = _sampling_grid(lens, size)
+    rows, columns = (
+        np.clip(((grid[..., axis] + 1.0) * (length / 2)).astype(np.intp), 0, length - 1)
+        for axis, length in ((1, shape[0]), (0, shape[1]))
+    )
+    return rows, columns
+
+
 class RemappedRows:
     """The pinhole image of a source; each band of a large photo reads only the rows that it samples."""
 
