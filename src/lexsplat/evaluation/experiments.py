@@ -150,7 +150,9 @@ class Bench:
         self.memory = parse_bytes(config.memory)
         self.ground_truth = read_held_out(self.capture, self.origin)
         self.gaussians = self.folder.read_gaussians().to(self.device)
-        self._encoders = Encoders(config.clip, config.dino, self.config.encoder_device)
+        self._encoders = Encoders(
+            config.clip, config.dino, self.config.encoder_device, config.features.segments
+        )
         self._maps: FeatureMaps | None = None
         self._texts = TextCache(self.folder.root / "checkpoints" / "texts")
         self._last: tuple[str, LanguageField | Method, dict[str, float], Peaks] | None = None

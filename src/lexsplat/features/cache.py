@@ -1,7 +1,8 @@
 """The feature cache on disk: one file per view and encoder, named by a hash of everything its content depends on.
 
 For CLIP, the file holds the embeddings of the crops, which are 10 to 50 times smaller than the dense map; the map is
-computed by a few small matrix products. For DINO, it holds the encoder's grid. Both are in half precision.
+computed by a few small matrix products. For DINO, it holds the encoder's grid. Both are in half precision. If
+features are pooled by 2D segments, these are stored in the same way.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.features.pyramid import CropLevel, dense_map, mean_map
@@ -233,6 +235,23 @@ def read_grid(path: Path, cols: int, rows: int) -> Tensor:
     if features.ndim != 3 or features.numel() == 0 or not bool(torch.isfinite(features).all()):
         raise _damaged(path, ValueError("no features, or NaN or infinity"))
     return resize_grid(features, cols, rows)
+
+
+def write_labels(path: Path, labels: NDArray[np.integer]) -> None:
+    """Store the segments of a view ``[L, h, w]`` (`lexsplat.features.segments2d`)."""
+    _write(path, {"labels": torch.from_numpy(np.ascontiguousarray(labels, np.int32))}, {})
+
+
+def read_labels(path: Path, cols: int, rows: int) -> Tensor:
+    """Stored segments ``[L, rows, cols]`` int32, -1 for none.
+
+    Raises:
+        FileFormatError: If the file is not such a cache file.
+    """
+    labels = _read(path)[0].get("labels", torch.zeros(0))
+    if labels.ndim != 3 or labels.shape[1:] != (rows, cols) or labels.dtype != torch.int32:
+        raise _damaged(path, ValueError("no segments of this size"))
+    return labels
 
 
 def resize_grid(features: Tensor, cols: int, rows: int) -> Tensor:

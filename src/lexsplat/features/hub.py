@@ -34,6 +34,8 @@ _VOCABULARIES = (
     "tokenizer.json", "vocab.json", "vocab.txt", "spiece.model", "tokenizer.model", "sentencepiece.bpe.model",
 )  # fmt: skip
 _TOKENIZER_SETTINGS = ("tokenizer_config.json", "special_tokens_map.json", "added_tokens.json")
+_OTHERS = {"segments": "superpixels, which need no model (`--features.segments slic`)"}
+"""What is there in place of a model that has no bundled one."""
 _HUB_TIMEOUT = 5.0  # seconds to wait for the hub's first response; without a network it fails at once
 
 
@@ -47,7 +49,7 @@ def model_folder(name: str, tower: str) -> Path:
 
     Args:
         name: A folder, a name on the Hugging Face Hub, or "bundled".
-        tower: What the model is used as: "clip" or "dino".
+        tower: What the model is used as: "clip", "dino" or "segments".
 
     Returns:
         A folder with a configuration, weights, and for "clip" a tokenizer.
@@ -79,7 +81,7 @@ def model_folder(name: str, tower: str) -> Path:
         return folder
     if folder.exists():
         is_model = (folder.parent / "config.json").is_file()
-        remedy = f"give its folder: --{tower} {folder.parent}" if is_model else _choices(tower)
+        remedy = f"give its folder: {_option(tower)} {folder.parent}" if is_model else _choices(tower)
         raise ModelError(name, expected="a model folder", found="a file", remedy=remedy)
     if "/" not in name and get_close_matches(name.lower(), ("bundled", "embedded")):
         expected, remedy = "a model folder, or a name OWNER/NAME", f"use `--{tower} bundled`"
@@ -205,7 +207,8 @@ def _remedy_for(lacking: str, name: str, tower: str) -> str:
         return (
             f"copy the tokenizer files of its repository to {name}, or write them there with save_pretrained"
         )
-    return f"give a folder written by save_pretrained, a model name, or `--{tower} bundled`"
+    other = _OTHERS.get(tower, f"`--{tower} bundled`")
+    return f"give a folder written by save_pretrained, a model name, or {other}"
 
 
 # -- the hub
@@ -320,7 +323,12 @@ def _megabytes(size: int) -> str:
 
 
 def _choices(tower: str) -> str:
-    return f"give another model, a folder (`--{tower} FOLDER`), or the small bundled encoder (`--{tower} bundled`)"
+    other = _OTHERS.get(tower, f"the small bundled encoder (`--{tower} bundled`)")
+    return f"give another model, a folder (`{_option(tower)} FOLDER`), or {other}"
+
+
+def _option(tower: str) -> str:
+    return f"--features.{tower}" if tower in _OTHERS else f"--{tower}"
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:

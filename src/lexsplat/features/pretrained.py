@@ -43,7 +43,7 @@ class PretrainedModel:
     """
 
     tower: ClassVar[str]
-    """What the model is used as: "clip" or "dino"."""
+    """What the model is used as: "clip", "dino" or "segments"."""
     _spare: ClassVar[str] = r"(position_ids|logit_scale|logit_bias)$"
     """Pattern of tensors that are not used, so that they may be missing."""
 

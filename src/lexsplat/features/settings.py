@@ -45,6 +45,9 @@ class FeatureConfig:
         dino_layer: Layer of the keys, 0-based; None is the last.
         dino_max_tokens: Most patches that DINO's attention sees at once; larger images are evaluated in overlapping
             windows.
+        segments: 2D segments by which the features of a photo are pooled, so that they end where segments end:
+            "none", "slic" (superpixels), "sam2", the name or folder of a SAM 2 model, or a folder with one map of
+            segments a photo (docs/captures.md).
 
     Raises:
         ValueError: If a setting is out of range, or two contradict each other.
@@ -65,6 +68,7 @@ class FeatureConfig:
     dino_facet: Facet = "key"
     dino_layer: int | None = None
     dino_max_tokens: int = 4096
+    segments: str = "none"
 
     def __post_init__(self) -> None:
         if self.mode not in ("grid", "random"):
@@ -83,6 +87,8 @@ class FeatureConfig:
             raise ValueError(f"crop_tokens={self.crop_tokens} needs mode=grid; random crops have no patches")
         if self.dino_facet not in ("key", "token"):
             raise ValueError(f"dino_facet must be 'key' or 'token', got {self.dino_facet!r}")
+        if not self.segments.strip():
+            raise ValueError("segments must be none, slic, sam2, a folder or a model, got nothing")
         sizes = ("map_cells", "max_short_side", "dino_short_side", "dino_stride", "dino_max_tokens")
         for name in (*sizes, "random_crops", "random_levels"):
             if getattr(self, name) < 1:

@@ -207,6 +207,13 @@ def build_model(folder: Path, name: str, spare: str) -> Any:
     state = load_weights(folder, name)
     try:
         config = AutoConfig.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
+        if (
+            config.model_type == "sam2_video"
+        ):  # SAM 2 as it is published; its part for photos is a model of its own
+            from transformers import Sam2Config
+
+            parts = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
+            config = Sam2Config(**{part: getattr(config, part) for part in parts})
         with torch.device("meta"):
             kind = type(AutoModel.from_config(config))
         model, report = kind.from_pretrained(

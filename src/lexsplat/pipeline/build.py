@@ -19,6 +19,7 @@ from lexsplat.captures import Capture, View, load_annotations
 from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook
 from lexsplat.features import FeatureMaps, check_external_features, external_identity
+from lexsplat.features.segments2d import check_segments
 from lexsplat.geometry.world import World, parse_vector
 from lexsplat.language.code_maps import MaskedCodeMaps, mark_masked_cells
 from lexsplat.language.methods import METHODS, FitRun, TrainingViews
@@ -27,7 +28,13 @@ from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.distribution import extract_on_workers
 from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps, fetch_clip
 from lexsplat.pipeline.inputs import PhotoSurvey, prepare_capture, refuse_without_cameras, survey_photos
-from lexsplat.pipeline.provenance import model_identity, model_place, with_full_paths, write_provenance
+from lexsplat.pipeline.provenance import (
+    features_identity,
+    model_identity,
+    model_place,
+    with_full_paths,
+    write_provenance,
+)
 from lexsplat.pipeline.splats import check_agreement, existing_splats, splats_hash
 from lexsplat.pipeline.viewpoints import capture_of_splats, splats_of_capture
 from lexsplat.pipeline.viewpoints.choosing import SIZE
@@ -120,6 +127,7 @@ def build(
             _check_photos(capture, parse_bytes(config.memory))
             if config.features_from is not None:
                 check_external_features(config.features_from, capture)
+            check_segments(config.features, capture)
             builder = _Builder(capture, folder, config, device, listener, splats)
             builder.encoders, builder.workers = checked, workers
             SharedFolder.forget_marks(folder.root / "checkpoints")
@@ -242,7 +250,7 @@ class _Builder:
         if config.features_from is not None:
             return [capture_hash, external_identity(config.features_from, self.capture), clip]
         dino = model_identity(config.dino if config.uses_dino else "none", "dino")
-        return [capture_hash, config.features, [clip, dino]]
+        return [capture_hash, *features_identity(config.features, self.capture), [clip, dino]]
 
     def _fingerprint(self, stage: _Stage) -> str:
         return fingerprint([

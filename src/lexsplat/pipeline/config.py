@@ -141,6 +141,10 @@ class BuildConfig:
             raise ValueError(f"checkpoint_seconds must be at least 0, got {self.checkpoint_seconds:g}")
         if self.iterations is not None and self.iterations < 1:
             raise ValueError(f"iterations must be positive, got {self.iterations}")
+        if self.features_from is not None and self.features.segments != "none":
+            raise ValueError(
+                "features of another program are used as they are: leave --features.segments out"
+            )
         if self.frames < 3:
             raise ValueError(f"frames must be at least 3, got {self.frames}")
         if self.up is not None:

@@ -16,12 +16,14 @@ from lexsplat.features.clip_text import UNLIKE_WORDS
 from lexsplat.features.estimate import estimate
 from lexsplat.features.hub import model_folder
 from lexsplat.features.masking import without_masked_cells
+from lexsplat.features.segments2d import load_segmenter, pooled_features
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import NOTE, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
+    from lexsplat.features.segments2d import Segmenter
     from lexsplat.features.text import TextTower
 
 log = logging.getLogger("lexsplat")
@@ -32,22 +34,24 @@ BUNDLED_SCENES = Path(__file__).resolve().parents[1] / "demo"
 
 
 class Encoders:
-    """CLIP and DINO, each loaded when it is first used and then kept.
+    """CLIP, DINO and what finds 2D segments, each loaded when it is first used and then kept.
 
     Args:
         clip: Name or folder of the image-text encoder.
         dino: Name or folder of the dense encoder, or "none".
         device: Device to compute on.
+        segments: Where 2D segments come from (`FeatureConfig.segments`).
     """
 
-    def __init__(self, clip: str, dino: str, device: str) -> None:
-        self._clip_name, self._dino_name, self.device = clip, dino, device
+    def __init__(self, clip: str, dino: str, device: str, segments: str = "none") -> None:
+        self._clip_name, self._dino_name, self._segments, self.device = clip, dino, segments, device
         self.text: TextTower | None = None
 
     @classmethod
     def of(cls, config: BuildConfig) -> Encoders:
         """Those of resolved settings."""
-        return cls(config.clip, config.dino if config.uses_dino else "none", config.encoder_device)
+        dino = config.dino if config.uses_dino else "none"
+        return cls(config.clip, dino, config.encoder_device, config.features.segments)
 
     @cached_property
     def clip(self) -> ImageTextEncoder:
@@ -63,11 +67,18 @@ class Encoders:
 
         return None if self._dino_name == "none" else load_dino(self._dino_name, self.device)
 
+    @cached_property
+    def segmenter(self) -> Segmenter | None:
+        """What finds 2D segments; None if features are not pooled by them."""
+        return None if self._segments == "none" else load_segmenter(self._segments, self.device)
+
     def keep_text(self, device: str) -> None:
         """Free the encoders of photos; the text tower of CLIP stays as `text`, on a device."""
         from lexsplat.features.clip import ClipEncoder
 
-        clip, _ = self.__dict__.pop("clip", None), self.__dict__.pop("dino", None)
+        clip = self.__dict__.pop("clip", None)
+        for name in ("dino", "segmenter"):
+            self.__dict__.pop(name, None)
         self.text = clip.text_only(device) if isinstance(clip, ClipEncoder) else clip
 
 
@@ -113,6 +124,7 @@ def check_encoders(
         if config.clip != "bundled":
             encoders.clip.encode_text(UNLIKE_WORDS)
         return encoders
+    _ = encoders.segmenter
     if config.features.tokens != "class":
         check_patches(folder, config.clip)
     if config.clip == "bundled" and config.dino in ("bundled", "none"):
@@ -144,7 +156,8 @@ def feature_maps(
 ) -> FeatureMaps:
     """Features of every view, extracted if the cache does not have them; masked cells are zero.
 
-    With ``config.features_from`` the features of another program are read instead.
+    They are pooled by 2D segments if ``config.features.segments`` says so. With ``config.features_from`` the features
+    of another program are read instead.
 
     Args:
         capture: Its views, at the resolution they were captured in.
@@ -159,7 +172,12 @@ def feature_maps(
         maps = extract_features(
             capture, clip, dino, config.features, cache_dir=cache_dir, memory=memory, listener=listener
         )
-        return without_masked_cells(maps, capture)
+        maps = without_masked_cells(maps, capture)
+        if config.features.segments == "none" or encoders.segmenter is None:
+            return maps
+        return pooled_features(
+            maps, capture, encoders.segmenter, config.features, cache_dir=cache_dir, listener=listener
+        )
     if any(view.lens.distorts for view in capture.views.values()):
         log.warning("the photos are distorted; features of another program are taken as undistorted")
     maps = load_external_features(

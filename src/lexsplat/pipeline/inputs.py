@@ -36,6 +36,7 @@ from lexsplat.captures.sfm.preparation import (
 )
 from lexsplat.captures.splits import choose_test_names
 from lexsplat.features import check_external_features
+from lexsplat.features.segments2d import check_segments
 from lexsplat.geometry.cameras import Camera
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import CaptureError, SceneFolderError
@@ -145,14 +146,17 @@ def preview_capture(
 def survey_photos(
     source: Path, output: Path, config: BuildConfig, test_names: list[str] | None
 ) -> PhotoSurvey | None:
-    """Look at photos without cameras, their ground truth and features of another program; None if there are cameras.
+    """Look at photos without cameras, and at what was made of them elsewhere; None if there are cameras.
+
+    That is ground truth, 2D segments, and features of another program.
 
     Masks are checked by structure from motion before it searches features.
 
     Raises:
         CaptureError: As `preview_capture`, if there is neither a camera nor a photo, or if ground truth belongs to no
             photo or does not fit it.
-        FileFormatError: If features of another program do not fit the photos.
+        FileFormatError: If features of another program or 2D segments do not fit the photos.
+        ModelError: If 2D segments come from nothing known.
     """
     check_capture(source)
     if not is_photo_folder(source):
@@ -163,6 +167,7 @@ def survey_photos(
     load_annotations(capture)
     if config.features_from is not None:
         check_external_features(config.features_from, capture)
+    check_segments(config.features, capture)
     return PhotoSurvey(len(capture.train_names), _largest(capture))
 
 

@@ -6,11 +6,14 @@ import logging
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lexsplat.captures import Capture
+from lexsplat.features import FeatureConfig
 from lexsplat.features.hub import content_hash, model_folder
+from lexsplat.features.segments2d import SOURCES, sam2_name, segments_identity
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.world import parse_vector, stored_world, world_of
@@ -44,6 +47,7 @@ def write_provenance(folder: SceneFolder, capture: Capture, config: BuildConfig)
         **to_json(config),
         "clip": model_place(config.clip),  # the scene may be opened from another working folder
         "dino": model_place(config.dino),
+        "features": to_json(_with_full_paths(config.features)),
     }
     folder.record["provenance"] = {
         "lexsplat": version("lexsplat"),
@@ -91,7 +95,24 @@ def with_full_paths(config: BuildConfig) -> BuildConfig:
         clip=model_place(config.clip),
         dino=model_place(config.dino),
         features_from=None if features is None else features.absolute(),
+        features=_with_full_paths(config.features),
     )
+
+
+def _with_full_paths(features: FeatureConfig) -> FeatureConfig:
+    segments = features.segments
+    return features if segments in SOURCES else replace(features, segments=model_place(segments))
+
+
+def features_identity(features: FeatureConfig, capture: Capture) -> list[Any]:
+    """What identifies settings of features: without segments the same as before there were any."""
+    settings = to_json(features)
+    name = settings.pop("segments")
+    if name == "none":
+        return [settings]
+    model = sam2_name(name)
+    segments = segments_identity(name, capture) if model is None else model_identity(model, "segments")
+    return [settings, ["segments", *segments]]
 
 
 def model_identity(name: str, kind: str) -> list[str]:

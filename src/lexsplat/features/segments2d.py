@@ -1,0 +1,299 @@
+"""Segments of photos in 2D, and features that are pooled by them, so that they end where segments end.
+
+Segments come from superpixels (SLIC), from a folder with one map a photo, or from SAM 2. There may be several levels
+of them, from parts to things. The features of a segment are replaced by their mean; levels are pooled apart, and each
+counts as an observation of the pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.features.cache import FeatureMap, FeatureMaps, hash_of, is_stored, read_labels, write_labels
+from lexsplat.features.external import open_npy, segment_numbers
+from lexsplat.features.extraction import pixels_hash, size_of_map
+from lexsplat.features.settings import FeatureConfig
+from lexsplat.runtime.errors import FileFormatError, ModelError
+from lexsplat.runtime.fingerprints import file_hash
+from lexsplat.runtime.progress import Event, Listener, silent
+
+if TYPE_CHECKING:
+    from lexsplat.captures import Capture, View
+
+SOURCES = ("none", "slic", "sam2")
+"""Words for where segments come from, beside folders and models."""
+
+SUPERPIXELS = (800, 200)
+"""Superpixels of a photo in each level of "slic"."""
+
+_COMPACTNESS = 10.0  # of superpixels: weight of distance beside that of color
+_SHORT_SIDE = 480  # pixels of the photo in which superpixels are searched: about four a cell
+_ENDINGS = (".png", ".npy", "_s.npy")
+
+
+class Segmenter(Protocol):
+    """Finds the segments of photos."""
+
+    def key(self, view: View) -> list[Any]:
+        """Everything the segments of a view depend on, as JSON-like values."""
+        ...
+
+    def labels(self, view: View, size: tuple[int, int]) -> NDArray[np.int32]:
+        """Segments at a width and height ``[L, height, width]``, numbered in each of L levels; -1 for none."""
+        ...
+
+
+def is_folder_of_segments(name: str) -> bool:
+    """Whether a value of `FeatureConfig.segments` names a folder of maps rather than a word or a model."""
+    folder = Path(name).expanduser()
+    return name not in SOURCES and folder.is_dir() and not (folder / "config.json").is_file()
+
+
+def sam2_name(name: str) -> str | None:
+    """The name or folder of the SAM 2 model that a value of `FeatureConfig.segments` stands for, if any.
+
+    Raises:
+        ModelError: If the value is no word, folder or name.
+    """
+    if name == "sam2":
+        from lexsplat.features.sam2 import DEFAULT_SAM2
+
+        return DEFAULT_SAM2
+    if name in SOURCES or is_folder_of_segments(name):
+        return None
+    if "/" in name or Path(name).expanduser().is_dir():
+        return name
+    close = get_close_matches(name.lower(), SOURCES, n=1)
+    raise ModelError(
+        f"features.segments {name}",
+        expected="none, slic, sam2, a folder of segments, or a SAM 2 model OWNER/NAME",
+        found="no such word and no such folder",
+        remedy=f"did you mean {close[0]}?" if close else "check the path",
+    )
+
+
+def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
+    """What finds segments.
+
+    Args:
+        name: "slic", "sam2", a folder of segments, or the name or folder of a SAM 2 model.
+        device: Device of SAM 2.
+
+    Raises:
+        ModelError: If it is none of them, or the model cannot be loaded.
+    """
+    model = sam2_name(name)
+    if model is not None:
+        from lexsplat.features.sam2 import load_sam2
+
+        return load_sam2(model, device)
+    return Superpixels() if name == "slic" else SegmentFolder(Path(name).expanduser())
+
+
+class Superpixels:
+    """SLIC superpixels of several sizes, by scikit-image. The same photo gives the same ones."""
+
+    def key(self, view: View) -> list[Any]:
+        """The photo and the settings."""
+        return ["slic", SUPERPIXELS, _COMPACTNESS, pixels_hash(view, _reduced(view.capture_size))]
+
+    def labels(self, view: View, size: tuple[int, int]) -> NDArray[np.int32]:
+        """A level for each number of superpixels; see `Segmenter`."""
+        from skimage.segmentation import slic
+
+        from lexsplat.captures.images.reading import resize_nearest
+
+        image = view.load_image(_reduced(view.capture_size))
+        levels = [
+            slic(image, number, compactness=_COMPACTNESS, start_label=0, channel_axis=-1)
+            for number in SUPERPIXELS
+        ]
+        return np.stack([resize_nearest(level, size) for level in levels]).astype(np.int32)
+
+
+def _reduced(capture_size: tuple[int, int]) -> tuple[int, int]:
+    factor = min(1.0, _SHORT_SIDE / min(capture_size))
+    return max(1, round(capture_size[0] * factor)), max(1, round(capture_size[1] * factor))
+
+
+class SegmentFolder:
+    """A folder with one map of segments a photo, named after it without its suffix.
+
+    - ``STEM.png``: 8 or 16 bits of one channel; 0 for none.
+    - ``STEM.npy``: integers ``[h, w]`` or ``[levels, h, w]``; -1 for none.
+    - ``STEM_s.npy``: the same, as written by LangSplat's preprocessing.
+
+    Maps have the photo's aspect at any size, and are drawn on the photo as it is stored, or undistorted.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def key(self, view: View) -> list[Any]:
+        """The content of the file, and what undistorts it."""
+        lens = view.lens
+        camera = [lens.model, lens.width, lens.height, lens.params, view.capture_size]
+        return ["folder", file_hash(self.path(view), 16), *camera]
+
+    def path(self, view: View) -> Path:
+        """The file of a view.
+
+        Raises:
+            FileFormatError: If there is none.
+        """
+        paths = [self.folder / f"{view.stem}{ending}" for ending in _ENDINGS]
+        found = next((path for path in paths if path.is_file()), None)
+        if found is None:
+            raise FileFormatError(
+                self.folder,
+                expected=", ".join(f"{view.stem}{ending}" for ending in _ENDINGS[:-1])
+                + f" or {view.stem}{_ENDINGS[-1]}",
+                found="none of them",
+                remedy="give one map of segments a photo, named after it without its suffix",
+            )
+        return found
+
+    def labels(self, view: View, size: tuple[int, int]) -> NDArray[np.int32]:
+        """The segments at the centers of cells; see `Segmenter`.
+
+        Raises:
+            FileFormatError: If the file is no map of integers.
+            CaptureError: If it cannot be read, or does not have the photo's aspect.
+        """
+        path = self.path(view)
+        if path.suffix == ".png":
+            levels = _png_numbers(path)[None]
+        else:
+            levels = open_npy(path)
+            if levels.ndim not in (2, 3) or 0 in levels.shape:
+                raise FileFormatError(
+                    path,
+                    expected="segments [h, w] or [levels, h, w]",
+                    found=str(list(levels.shape)),
+                    remedy="write it again (docs/captures.md has the layout)",
+                )
+            levels = levels.reshape(-1, *levels.shape[-2:])
+        sampled = np.stack([view.undistort_labels(level, path, size) for level in levels])
+        return segment_numbers(sampled, path).astype(np.int32)
+
+
+def _png_numbers(path: Path) -> NDArray[np.int32]:
+    """Numbers ``[h, w]`` of a PNG of one channel, less 1: black is -1, no segment."""
+    from lexsplat.captures.images.reading import open_image
+
+    with open_image(path) as image:
+        if image.mode not in ("1", "L", "P", "I") and not image.mode.startswith("I;"):
+            raise FileFormatError(
+                path,
+                expected="one number a pixel, 8 or 16 bits",
+                found=f"an image of mode {image.mode}",
+                remedy="write the numbers of segments, not colors",
+            )
+        return np.asarray(image).astype(np.int32) - 1
+
+
+def check_segments(config: FeatureConfig, capture: Capture) -> None:
+    """Refuse what can be known about segments before anything that takes time; models are checked when loaded.
+
+    Args:
+        config: Settings of the features.
+        capture: Its training views must have segments, if they come from a folder.
+
+    Raises:
+        FileFormatError: If a map is missing or no map of integers.
+        CaptureError: If a map cannot be read, or does not have the photo's aspect.
+        ModelError: If the name is no word, folder or name of a model.
+    """
+    name = config.segments
+    if sam2_name(name) is None and is_folder_of_segments(name):
+        folder = SegmentFolder(Path(name).expanduser())
+        for view in capture.train_views:
+            folder.labels(view, size_of_map(view.capture_size, config))
+
+
+def segments_identity(name: str, capture: Capture) -> list[str]:
+    """The name, and of a folder of segments the content of every file that training reads."""
+    if not is_folder_of_segments(name):
+        return [name]
+    folder = SegmentFolder(Path(name).expanduser())
+    return ["folder", *(f"{view.stem} {file_hash(folder.path(view), 16)}" for view in capture.train_views)]
+
+
+# Beside the maps: where the segments come from and are kept, and who is told.
+def pooled_features(
+    maps: FeatureMaps,
+    capture: Capture,
+    segmenter: Segmenter,
+    config: FeatureConfig,
+    *,
+    cache_dir: Path,
+    listener: Listener = silent,
+) -> FeatureMaps:
+    """Feature maps that are pooled by segments when they are read; the segments are found once and stored.
+
+    Args:
+        maps: Maps by view name, of the size that ``config`` gives; zero cells stay zero and count for no segment.
+        capture: The views.
+        segmenter: Finds the segments of a view.
+        config: Settings of the features.
+        cache_dir: Folder of the cache.
+        listener: Receives events of stage "2D segments".
+
+    Raises:
+        LexsplatError: If a view has no segments (`SegmentFolder.labels`).
+    """
+    paths: dict[str, Path] = {}
+    for done, name in enumerate(maps, start=1):
+        view = capture.views[name]
+        size = size_of_map(view.capture_size, config)
+        paths[name] = (
+            Path(cache_dir) / f"{hash_of('segments', segmenter.key(view), size)}.segments.safetensors"
+        )
+        if not is_stored(paths[name]):
+            write_labels(paths[name], segmenter.labels(view, size))
+        listener(Event("2D segments", done, len(maps)))
+
+    def load(name: str) -> FeatureMap:
+        found = maps[name]
+        rows, cols = found.clip.shape[:2]
+        labels = read_labels(paths[name], cols, rows)
+        return FeatureMap(pool(found.clip, labels), None if found.dino is None else pool(found.dino, labels))
+
+    return FeatureMaps(list(maps), load, 0, source=maps)
+
+
+def pool(features: Tensor, labels: Tensor | Sequence[Tensor]) -> Tensor:
+    """The mean direction of the features of each segment, in all of its cells.
+
+    Args:
+        features: Unit vectors ``[h, w, D]``; zero where a cell is ignored.
+        labels: Segments ``[L, h, w]``, integers; -1 for none.
+
+    Returns:
+        ``[h, w, D]``: the mean of the unit vectors of the levels that have a segment there, shorter than 1 where
+        levels disagree; the cell's own feature where none has; zero where it is ignored.
+    """
+    from scipy.sparse import csr_matrix
+
+    flat = features.reshape(-1, features.shape[-1])
+    known = flat.any(-1)
+    total, count = torch.zeros_like(flat), torch.zeros(len(flat), 1)
+    for level in labels:
+        inside = ((level.reshape(-1) >= 0) & known).nonzero()[:, 0]
+        if len(inside) == 0:
+            continue
+        segments = level.reshape(-1)[inside].unique(return_inverse=True)[1]
+        members = (segments.numpy(), np.arange(len(inside)))
+        sums = csr_matrix((np.ones(len(inside), np.float32), members)) @ flat[inside].numpy()
+        total[inside] += F.normalize(torch.from_numpy(sums), dim=-1)[segments]
+        count[inside] += 1
+    return torch.where(count > 0, total / count.clamp_min(1), flat).reshape(features.shape)
