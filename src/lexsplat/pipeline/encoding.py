@@ -18,7 +18,7 @@ from lexsplat.features.hub import model_folder
 from lexsplat.features.masking import without_masked_cells
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.memory import parse_bytes
-from lexsplat.runtime.progress import NOTE, Listener, silent
+from lexsplat.runtime.progress import NOTE, Event, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
@@ -81,7 +81,11 @@ def fetch_clip(config: BuildConfig) -> None:
 
 
 def check_encoders(
-    config: BuildConfig, source: Path | None = None, photos: int = 0, size: tuple[int, int] = (1440, 1080)
+    config: BuildConfig,
+    source: Path | None = None,
+    photos: int = 0,
+    size: tuple[int, int] = (1440, 1080),
+    listener: Listener = silent,
 ) -> Encoders:
     """Load the encoders of the settings, check them, and log how long the features will take.
 
@@ -92,6 +96,7 @@ def check_encoders(
         source: The capture, to which bundled encoders must suit; None is not checked.
         photos: Number of photos.
         size: Width and height of a photo.
+        listener: Receives events of stage "encoders": loaded, checked with words, the dense one checked, timed.
 
     Returns:
         The encoders, loaded as far as they were checked.
@@ -118,7 +123,11 @@ def check_encoders(
     if config.clip == "bundled" and config.dino in ("bundled", "none"):
         return encoders
     log.log(NOTE, "the encoders are loaded, checked and timed")
-    right = rank_words(encoders.clip)
+    listener(Event("encoders", 0, 4))
+    clip = encoders.clip
+    listener(Event("encoders", 1, 4))
+    right = rank_words(clip)
+    listener(Event("encoders", 2, 4))
     if right < ENOUGH:
         # Only a warning: an encoder may be made for other things than the bundled images show.
         log.warning(
@@ -129,9 +138,11 @@ def check_encoders(
         )
     if encoders.dino is not None:
         check_dense(encoders.dino)
+    listener(Event("encoders", 3, 4))
     if photos:
         found = estimate(encoders.clip, encoders.dino, config.features, size)
         log.log(NOTE, "features on %s: %s", config.encoder_device, found.describe(photos))
+    listener(Event("encoders", 4, 4))
     return encoders
 
 
