@@ -1,6 +1,7 @@
 """Benchmarks run by hand and rarely; these tests check that they fit the package."""
 
 import json
+import logging
 import runpy
 import sys
 from pathlib import Path
@@ -70,3 +71,25 @@ def test_operations_of_an_encoder_are_those_of_its_matrix_products(monkeypatch):
         layer(torch.rand(2, 3, 8, 8))
     # The convolution has 2 x 4 outputs of 48 inputs, the linear layer 2 x 8 rows.
     assert dict(products.sizes) == {(1, 8, 48, 8): 1, (1, 16, 4, 5): 1}
+
+
+def test_told_times_are_read_from_what_a_build_says(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import forecasts
+
+    from lexsplat.features.estimate import Estimate
+
+    notes = forecasts.Notes()
+    for message in (
+        "reconstruct: about 2:05 min for 2,250 iterations",
+        f"features on cpu: {Estimate(1176, 90.0).describe(100)}",
+        "workers: 2 nodes, 4 cores",
+    ):
+        notes.emit(logging.LogRecord("lexsplat", 25, "", 0, message, (), None))
+    assert notes.told == {"reconstruct": 125.0, "features": 9000.0}
+    notes.emit(
+        logging.LogRecord(
+            "lexsplat", 25, "", 0, f"features on cpu: {Estimate(12, 1.2).describe(50)}", (), None
+        )
+    )
+    assert notes.told["features"] == 60.0

@@ -14,6 +14,7 @@ from lexsplat.features.checks import ENOUGH, check_dense, rank_words
 from lexsplat.features.clip import check_patches
 from lexsplat.features.clip_text import UNLIKE_WORDS
 from lexsplat.features.estimate import estimate
+from lexsplat.features.extraction import missing_views
 from lexsplat.features.hub import model_folder
 from lexsplat.features.masking import without_masked_cells
 from lexsplat.pipeline.config import BuildConfig
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from lexsplat.features.text import TextTower
 
 log = logging.getLogger("lexsplat")
+
+_TOLD_FROM = 12
+"""Photos from which the time of the bundled encoders is told; timing them takes as long as about one."""
 
 
 BUNDLED_SCENES = Path(__file__).resolve().parents[1] / "demo"
@@ -146,6 +150,17 @@ def check_encoders(
     return encoders
 
 
+def _tell_time(capture: Capture, config: BuildConfig, encoders: Encoders, cache_dir: Path) -> None:
+    """Log how long the features of the views that are not cached will take; nothing for a few seconds."""
+    clip, dino, settings = encoders.clip, encoders.dino, config.features
+    missing = missing_views(capture, clip, dino, settings, cache_dir)
+    if len(missing) < _TOLD_FROM:
+        return
+    sizes = [capture.views[name].capture_size for name in missing]
+    found = estimate(clip, dino, settings, max(sizes, key=lambda size: size[0] * size[1]))
+    log.log(NOTE, "features on %s: %s", config.encoder_device, found.describe(len(missing)))
+
+
 def feature_maps(
     capture: Capture,
     config: BuildConfig,
@@ -167,6 +182,8 @@ def feature_maps(
     memory = parse_bytes(config.memory)
     if config.features_from is None:
         clip, dino = encoders.clip, encoders.dino
+        if config.clip == "bundled":  # others are timed when they are checked
+            _tell_time(capture, config, encoders, cache_dir)
         maps = extract_features(
             capture, clip, dino, config.features, cache_dir=cache_dir, memory=memory, listener=listener
         )
