@@ -46,7 +46,7 @@ def test_only_encoders_that_take_part_are_looked_for(changes, missing):
         check_encoders(config)
 
 
-def test_the_time_of_the_bundled_encoders_is_told_before_the_features(
+def test_the_time_of_the_features_is_told_once_if_no_check_has_told_it(
     tiny_capture, tmp_path, monkeypatch, caplog
 ):
     monkeypatch.setattr(encoding, "_TOLD_FROM", 1)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("lexsplat")
 
 _TOLD_FROM = 12
-"""Photos from which the time of the bundled encoders is told; timing them takes as long as about one."""
+"""Photos from which the time is told that no check has told; measuring it takes as long as about one."""
 
 
 BUNDLED_SCENES = Path(__file__).resolve().parents[1] / "demo"
@@ -47,6 +47,7 @@ class Encoders:
     def __init__(self, clip: str, dino: str, device: str) -> None:
         self._clip_name, self._dino_name, self.device = clip, dino, device
         self.text: TextTower | None = None
+        self.told = False  # whether the time of the features is logged
 
     @classmethod
     def of(cls, config: BuildConfig) -> Encoders:
@@ -146,6 +147,7 @@ def check_encoders(
     if photos:
         found = estimate(encoders.clip, encoders.dino, config.features, size)
         log.log(NOTE, "features on %s: %s", config.encoder_device, found.describe(photos))
+        encoders.told = True
     listener(Event("encoders", 4, 4))
     return encoders
 
@@ -159,6 +161,7 @@ def _tell_time(capture: Capture, config: BuildConfig, encoders: Encoders, cache_
     sizes = [capture.views[name].capture_size for name in missing]
     found = estimate(clip, dino, settings, max(sizes, key=lambda size: size[0] * size[1]))
     log.log(NOTE, "features on %s: %s", config.encoder_device, found.describe(len(missing)))
+    encoders.told = True
 
 
 def feature_maps(
@@ -182,7 +185,7 @@ def feature_maps(
     memory = parse_bytes(config.memory)
     if config.features_from is None:
         clip, dino = encoders.clip, encoders.dino
-        if config.clip == "bundled":  # others are timed when they are checked
+        if not encoders.told:
             _tell_time(capture, config, encoders, cache_dir)
         maps = extract_features(
             capture, clip, dino, config.features, cache_dir=cache_dir, memory=memory, listener=listener
