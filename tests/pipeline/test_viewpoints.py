@@ -434,8 +434,12 @@ def test_a_build_of_splats_alone_keeps_its_views_and_repeats_no_choice(tmp_path)
     splats, output = tmp_path / "theirs.ply", tmp_path / "scene"
     write_ply(solid(on_table()), splats)
     config = BuildConfig(clip="bundled", dino="none", device="cpu", up="0,0,1")
-    events = []
-    folder = build(None, output, config, until="reconstruct", splats=splats)
+    events, told = [], []
+    folder = build(None, output, config, until="reconstruct", splats=splats, listener=told.append)
+    for name in ("views", "comparison", "pictures"):
+        shares = [event.done / event.total for event in told if event.stage == name]
+        assert shares == sorted(shares)
+        assert shares[-1] == 1
     again = build(None, output, config, until="reconstruct", splats=splats, listener=events.append)
     assert folder.record["stages"]["views"] == again.record["stages"]["views"]
     assert "views" not in {event.stage for event in events}

@@ -18,7 +18,7 @@ from lexsplat.pipeline.inputs import reload_capture
 from lexsplat.runtime.environment import machine_facts
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path, read_json, write_json
-from lexsplat.runtime.progress import Listener, silent
+from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.feature_maps import feature_picture
 from lexsplat.scenes.previous import require_current
@@ -84,7 +84,8 @@ def evaluate_scene(
         },
         machine=machine_facts(),
     )
-    for view in gallery.views:
+    for done, view in enumerate(gallery.views):
+        listener(Event("report", done, len(gallery.views)))
         gallery.add_features(view, feature_picture(scene, view).cpu().numpy())
     result = metrics.to_json()
     write_json(folder.root / "metrics.json", result)
@@ -95,6 +96,7 @@ def evaluate_scene(
         path = folder.root / "heatmaps" / file_name(prompt) / stem.with_name(stem.name + ".jpg")
         with atomic_path(path) as temporary:
             temporary.write_bytes(images["heatmap"])
+    listener(Event("report", len(gallery.views), len(gallery.views)))
     return result
 
 

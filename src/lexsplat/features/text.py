@@ -113,6 +113,7 @@ class TextCache:
             found = {}  # one of the files was made by something else
         new = [prompt for prompt in wanted if prompt not in found]
         if new:
+            listener(Event("words", 0, len(new)))  # before the model is loaded
             model = encoder()
             if model.content_hash != content_hash:
                 raise ValueError(f"{model.content_hash} is not the model of the features ({content_hash})")
