@@ -20,7 +20,7 @@ from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path, read_json, write_json
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.answers import file_name
-from lexsplat.scenes.feature_maps import feature_picture
+from lexsplat.scenes.feature_maps import code_colors, feature_picture
 from lexsplat.scenes.previous import require_current
 from lexsplat.scenes.scene import Scene
 
@@ -84,9 +84,10 @@ def evaluate_scene(
         },
         machine=machine_facts(),
     )
+    colors = code_colors(scene.field)
     for done, view in enumerate(gallery.views):
         listener(Event("report", done, len(gallery.views)))
-        gallery.add_features(view, feature_picture(scene, view).cpu().numpy())
+        gallery.add_features(view, feature_picture(scene, view, colors).cpu().numpy())
     result = metrics.to_json()
     write_json(folder.root / "metrics.json", result)
     write_rows(folder.root, "metrics", table_rows({title: result}))
