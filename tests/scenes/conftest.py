@@ -29,5 +29,6 @@ def published_demo(made_once) -> Path:
     from lexsplat.scenes.scene import open_scene
 
     return made_once(
-        "published_demo", lambda target: publish(open_scene("demo"), target, PublishOptions(title="A table top"))
+        "published_demo",
+        lambda target: publish(open_scene("demo"), target, PublishOptions(title="A table top")),
     )
