@@ -364,7 +364,7 @@ def test_a_build_leaves_floaters_out_of_the_scene_unless_they_are_kept(tmp_path,
     scene, splats = joined(clean, dust), tmp_path / "dusty.ply"
     write_ply(scene, splats)
     monkeypatch.setattr(stage, "choose_views", lambda *_, **__: choosing.ChosenViews((), UP, 0, 0, 0, 0))
-    monkeypatch.setattr(stage, "write_chosen_capture", lambda _, __, poses: poses.mkdir(parents=True))
+    monkeypatch.setattr(stage, "write_chosen_capture", lambda _, __, poses, *rest: poses.mkdir(parents=True))
     monkeypatch.setattr(stage, "load_capture", lambda poses, **_: SimpleNamespace(root=poses))
     for keep, count in ((False, len(scene) - len(of_dust())), (True, len(scene))):
         folder = SceneFolder(tmp_path / str(keep))
