@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from lexsplat.captures import load_capture
+from lexsplat.features import FeatureConfig
 from lexsplat.pipeline import encoding
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps
@@ -51,7 +52,8 @@ def test_the_time_of_the_features_is_told_once_if_no_check_has_told_it(
 ):
     monkeypatch.setattr(encoding, "_TOLD_FROM", 1)
     capture = load_capture(tiny_capture)
-    config = BuildConfig(clip="bundled", dino="none").resolved("cpu", (96, 72))
+    small = FeatureConfig(crop_sizes=(0.5,), crop_strides=(0.5,), map_cells=8, max_short_side=24)
+    config = BuildConfig(clip="bundled", dino="none", features=small).resolved("cpu", (96, 72))
     told = f"for {len(capture.views)} training photos"
     for expected in (1, 0):  # then the features are cached
         caplog.clear()
