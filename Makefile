@@ -22,7 +22,7 @@ demo: $(VENV)/.runtime  ## build, query and evaluate the scene that ships with t
 test: $(VENV)/.dev  ## run all tests
 	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadfile --no-loadscope-reorder
 
-test-fast: $(VENV)/.dev  ## run the tests that are not marked slow, in a minute and a half
+test-fast: $(VENV)/.dev  ## run the tests that are not marked slow, in a minute
 	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadfile --no-loadscope-reorder -m "not slow"
 
 lint: $(VENV)/.dev  ## style and types
