@@ -8,6 +8,8 @@ BIN := $(VENV)/bin
 OUTPUT ?= output/demo
 # Two workers: more only fight over the cores that the kernels already use.
 PYTEST_WORKERS ?= 2
+# What installs packages into the environment.
+INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .PHONY: demo test test-fast lint site install clean help
 
@@ -20,7 +22,7 @@ demo: $(VENV)/.runtime  ## build, query and evaluate the scene that ships with t
 test: $(VENV)/.dev  ## run all tests
 	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadfile --no-loadscope-reorder
 
-test-fast: $(VENV)/.dev  ## run the tests that are not marked slow, in a minute and a half
+test-fast: $(VENV)/.dev  ## run the tests that are not marked slow, in a minute
 	$(BIN)/python -m pytest -n $(PYTEST_WORKERS) --dist loadfile --no-loadscope-reorder -m "not slow"
 
 lint: $(VENV)/.dev  ## style and types
@@ -51,11 +53,11 @@ $(BIN)/pip:
 	echo "lexsplat needs Python 3.10 to 3.13, found:$${found:- none;} run: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)" >&2; exit 1
 
 $(VENV)/.runtime: pyproject.toml constraints.txt $(BIN)/pip
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	$(INSTALL) -c constraints.txt -e .
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt $(BIN)/pip
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(INSTALL) -c constraints.txt -e '.[dev]'
 	@touch $@ $(VENV)/.runtime
 
 clean:  ## remove the environment and everything written

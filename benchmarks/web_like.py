@@ -20,6 +20,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -28,7 +29,6 @@ from PIL import Image
 from records import argument_parser
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
-from transformers import CLIPModel
 
 from lexsplat.evaluation.demo import demo_capture
 from lexsplat.features.clip import ClipEncoder
@@ -37,6 +37,9 @@ from lexsplat.features.hub import model_folder
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.relevancy import CANONICAL_PHRASES
 from lexsplat.queries.vocabulary import COLORS, words
+
+if TYPE_CHECKING:
+    from transformers import CLIPModel
 
 KINDS = (
     "apple", "rubber duck", "mug", "stack of books", "vase", "ring", "traffic cone", "potted plant",
@@ -167,6 +170,8 @@ def make_web_like(folder: Path, seed: int = 0, facts: Facts = Facts(), private: 
         raise TypeError("the bundled encoder is a ClipEncoder")
     phrases = general_phrases(held_out=False)
     source = Path(model_folder("bundled", "clip"))
+    from transformers import CLIPModel  # takes seconds, and tests import this module
+
     model = CLIPModel.from_pretrained(source)
     sample = _sample(bundled, model, phrases.texts)
     draw = torch.Generator().manual_seed(seed)

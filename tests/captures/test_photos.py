@@ -20,10 +20,11 @@ from support.rooms import (
 from support.written_captures import save
 
 from lexsplat.captures import PoseConfig, load_capture, poses_from_photos
-from lexsplat.captures.sfm import mapping, photos
+from lexsplat.captures.sfm import counting, mapping, photos
 from lexsplat.captures.sfm.mapping import Attempt
 from lexsplat.captures.sfm.photos import find_photos
 from lexsplat.captures.sfm.preparation import prepare_photos, turned_upright
+from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
 from lexsplat.geometry.cameras import look_at
 from lexsplat.runtime.errors import CaptureError
 
@@ -47,6 +48,32 @@ def test_photos_are_registered_and_the_unregistered_one_is_named(room):
     assert "9 of 10 photos registered" in poses.note
     assert events[-1].done == events[-1].total
     assert events[-1].metrics == {"registered": 9, "photos": 10}
+
+
+def test_progress_counts_the_pairs_of_photos(room):
+    _, _, events = room
+    pairs = [event for event in events if event.stage == "matching"]
+    assert {event.total for event in pairs} == {45}, "ten photos"
+    counts = [event.done for event in pairs]
+    assert counts == sorted(counts)
+    assert (counts[0], counts[-1]) == (0, 45)
+
+
+@pytest.mark.parametrize(("pairs", "number"), [("exhaustive", 45), ("sequential", 25)])
+def test_the_number_of_pairs_is_the_one_that_pycolmap_matches(pairs, number, room, tmp_path, monkeypatch):
+    folder, _, _ = room
+    monkeypatch.setattr(counting, "_EVERY", 0.01)
+    prepared, found, config = prepare_photos(folder, tmp_path), [], PoseConfig(pairs=pairs, max_features=300)
+    database = tmp_path / "database.db"
+    with quiet_pycolmap(0):
+        mapping.extract_features(database, prepared, config, 1 << 30, lambda done: None)
+        mapping.match_photos(
+            database, 10, config, 0, 1 << 30, lambda done, total: found.append((done, total))
+        )
+    assert found[-1] == (number, number)
+    with counting.counts_of(database) as counts:
+        assert next(counts) == number
+    assert len({done for done, _ in found}) > 2, "it is counted meanwhile"
 
 
 def test_estimated_poses_are_the_true_ones_up_to_a_similarity(room):

@@ -78,7 +78,11 @@ def test_triangulated_points_have_the_colors_of_the_wall(triangulated):
 
 def test_triangulation_reports_progress_and_is_deterministic(wall, triangulated):
     positions, colors, _, events = triangulated
-    assert {event.stage for event in events} == {"triangulate"}
+    assert {event.stage for event in events} == {"triangulate", "matching"}
+    own = [event.done for event in events if event.stage == "triangulate"]
+    assert own == sorted(own)
+    matched = [event for event in events if event.stage == "matching"]
+    assert (matched[0].done, matched[-1].done) == (0, matched[0].total)
     assert (events[-1].done, events[-1].metrics) == (events[-1].total, {"points": len(positions)})
     again = triangulate(wall)
     np.testing.assert_array_equal(again[0], positions)

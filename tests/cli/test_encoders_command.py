@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
@@ -85,6 +86,25 @@ def test_the_estimate_counts_the_crops_that_extraction_encodes(tiny_capture, tmp
     size = next(iter(capture.views.values())).capture_size
     assert sum(encoded) == len(capture.views) * count_crops(config, size)
     assert estimate(clip, None, config, size).crops == count_crops(config, size)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_the_estimate_is_of_as_many_photos_at_once_as_the_extraction_takes(threads, monkeypatch):
+    clip, config, ticks, seen = load_clip("bundled"), FeatureConfig.sparse(), itertools.count(), []
+    inner = clip.encode_images
+    monkeypatch.setattr(
+        clip, "encode_images", lambda crops: seen.append(torch.get_num_threads()) or inner(crops)
+    )
+    monkeypatch.setattr("time.perf_counter", lambda: float(next(ticks)))
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        found = estimate(clip, None, config, (96, 72))
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert set(seen) == {1}, "each photo has one thread"
+    assert found.seconds == pytest.approx(found.crops / 64 / threads), "64 crops took one tick"
 
 
 def test_times_are_reported_in_their_unit():

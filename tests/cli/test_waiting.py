@@ -1,5 +1,7 @@
 """Progress of commands that are mostly quick."""
 
+import time
+
 from lexsplat.cli.waiting import LateProgress
 from lexsplat.runtime.progress import Event
 
@@ -20,3 +22,44 @@ def test_a_quick_stage_shows_nothing_and_a_slow_one_its_rate(capsys, monkeypatch
     assert "words: 2/10" in said
     assert "1.0/s" in said
     assert "words: 10/10" in said
+
+
+def test_a_stage_that_sends_nothing_is_shown_after_the_time(capsys):
+    listener = LateProgress(patience=0.05)
+    listener(Event("page", 0, 6))
+    deadline = time.monotonic() + 20
+    while "page: 0/6" not in (said := capsys.readouterr().err) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert "page: 0/6" in said
+    listener(Event("page", 6, 6))
+    assert "page: 6/6" in capsys.readouterr().err
+
+
+def test_a_quick_stage_within_a_slow_one_does_not_end_its_progress(capsys, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    listener = LateProgress()
+    listener(Event("page", 0, 6))
+    now[0] += 3.0
+    listener(Event("page", 1, 6))
+    listener(Event("words", 0, 2))
+    listener(Event("words", 2, 2))
+    now[0] += 20.0
+    listener(Event("page", 2, 6))
+    said = capsys.readouterr().err
+    assert "page: 1/6" in said
+    assert "page: 2/6" in said
+    listener(Event("page", 6, 6))
+
+
+def test_a_stage_that_failed_does_not_show_its_next_run_too_early(capsys, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    listener = LateProgress()
+    listener(Event("words", 0, 2))  # then the encoder is missing
+    now[0] += 1.5
+    listener(Event("words", 0, 2))
+    now[0] += 1.0
+    listener(Event("words", 1, 2))
+    listener(Event("words", 2, 2))
+    assert capsys.readouterr().err == ""

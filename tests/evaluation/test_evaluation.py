@@ -230,7 +230,7 @@ def test_progress_is_reported(capture, gaussians):
     events = []
     evaluate(capture, traced(capture, gaussians), QUICK, ground_truth=GroundTruth({}), listener=events.append)
     assert [(event.stage, event.done, event.total) for event in events] == [
-        ("evaluate", i, 3) for i in (1, 2, 3)
+        ("evaluate", i, 3) for i in (0, 1, 2, 3)
     ]
 
 

@@ -41,7 +41,11 @@ def quarters() -> tuple[torch.Tensor, torch.Tensor]:
 def test_segments_end_where_language_or_color_changes():
     language, colors = quarters()
     gaussians = floor(colors)
-    found = make_segments(gaussians, lambda rows: language[rows], torch.ones(len(gaussians)))
+    events = []
+    found = make_segments(gaussians, lambda rows: language[rows], torch.ones(len(gaussians)), events.append)
+    shares = [event.done / event.total for event in events]
+    assert shares == sorted(shares)
+    assert (shares[0], shares[-1]) == (0, 1)
     quarter = 2 * (gaussians.means[:, 0] >= SIDE / 2) + (gaussians.means[:, 1] >= SIDE / 2)
     for level in found.levels:
         for segment in range(int(level.max()) + 1):

@@ -148,7 +148,11 @@ def test_bundled_encoders_warn_of_other_places(tiny_capture, caplog):
 def test_the_time_of_the_features_is_reported_first(clip_folder, tmp_path, caplog):
     config = replace(CONFIG, clip=str(clip_folder)).resolved("cpu", (400, 300))
     with caplog.at_level(NOTE, logger="lexsplat"):
-        check_encoders(config, tmp_path, 50, (400, 300))
+        events = []
+        check_encoders(config, tmp_path, 50, (400, 300), events.append)
+    assert [(event.stage, event.done, event.total) for event in events] == [
+        ("encoders", done, 4) for done in range(5)
+    ]
     # The encoder has patches. Crops of 46 pixels every 27.6 or less: 14 x 11.
     assert "features on cpu: 154 crops and about" in caplog.text
     assert "for 50 training photos" in caplog.text

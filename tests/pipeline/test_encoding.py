@@ -4,9 +4,13 @@ from pathlib import Path
 
 import pytest
 
+from lexsplat.captures import load_capture
+from lexsplat.features import FeatureConfig
+from lexsplat.pipeline import encoding
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.pipeline.encoding import Encoders, check_encoders
+from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps
 from lexsplat.runtime.errors import ModelError
+from lexsplat.runtime.progress import NOTE
 
 
 def test_an_encoder_is_loaded_when_it_is_first_used_and_only_then(monkeypatch):
@@ -41,3 +45,18 @@ def test_only_encoders_that_take_part_are_looked_for(changes, missing):
         return
     with pytest.raises(ModelError, match="absent"):
         check_encoders(config)
+
+
+def test_the_time_of_the_features_is_told_once_if_no_check_has_told_it(
+    tiny_capture, tmp_path, monkeypatch, caplog
+):
+    monkeypatch.setattr(encoding, "_TOLD_FROM", 1)
+    capture = load_capture(tiny_capture)
+    small = FeatureConfig(crop_sizes=(0.5,), crop_strides=(0.5,), map_cells=8, max_short_side=24)
+    config = BuildConfig(clip="bundled", dino="none", features=small).resolved("cpu", (96, 72))
+    told = f"for {len(capture.views)} training photos"
+    for expected in (1, 0):  # then the features are cached
+        caplog.clear()
+        with caplog.at_level(NOTE, logger="lexsplat"):
+            feature_maps(capture, config, Encoders.of(config), tmp_path)
+        assert sum(told in message for message in caplog.messages) == expected

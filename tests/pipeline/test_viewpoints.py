@@ -364,7 +364,7 @@ def test_a_build_leaves_floaters_out_of_the_scene_unless_they_are_kept(tmp_path,
     scene, splats = joined(clean, dust), tmp_path / "dusty.ply"
     write_ply(scene, splats)
     monkeypatch.setattr(stage, "choose_views", lambda *_, **__: choosing.ChosenViews((), UP, 0, 0, 0, 0))
-    monkeypatch.setattr(stage, "write_chosen_capture", lambda _, __, poses: poses.mkdir(parents=True))
+    monkeypatch.setattr(stage, "write_chosen_capture", lambda _, __, poses, *rest: poses.mkdir(parents=True))
     monkeypatch.setattr(stage, "load_capture", lambda poses, **_: SimpleNamespace(root=poses))
     for keep, count in ((False, len(scene) - len(of_dust())), (True, len(scene))):
         folder = SceneFolder(tmp_path / str(keep))
@@ -434,8 +434,12 @@ def test_a_build_of_splats_alone_keeps_its_views_and_repeats_no_choice(tmp_path)
     splats, output = tmp_path / "theirs.ply", tmp_path / "scene"
     write_ply(solid(on_table()), splats)
     config = BuildConfig(clip="bundled", dino="none", device="cpu", up="0,0,1")
-    events = []
-    folder = build(None, output, config, until="reconstruct", splats=splats)
+    events, told = [], []
+    folder = build(None, output, config, until="reconstruct", splats=splats, listener=told.append)
+    for name in ("views", "comparison", "pictures"):
+        shares = [event.done / event.total for event in told if event.stage == name]
+        assert shares == sorted(shares)
+        assert shares[-1] == 1
     again = build(None, output, config, until="reconstruct", splats=splats, listener=events.append)
     assert folder.record["stages"]["views"] == again.record["stages"]["views"]
     assert "views" not in {event.stage for event in events}

@@ -1,6 +1,7 @@
 """Benchmarks run by hand and rarely; these tests check that they fit the package."""
 
 import json
+import logging
 import runpy
 import sys
 from pathlib import Path
@@ -98,3 +99,25 @@ def test_segments_of_two_balls_end_at_their_outlines(built, monkeypatch, tmp_pat
     recall, chance = (float(word) for word in lines[-1].replace(",", "").split()[5::2])
     assert recall > chance + 0.2
     assert len(list(tmp_path.glob("view_*-0.png"))) == 3
+
+
+def test_told_times_are_read_from_what_a_build_says(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import forecasts
+
+    from lexsplat.features.estimate import Estimate
+
+    notes = forecasts.Notes()
+    for message in (
+        "reconstruct: about 2:05 min for 2,250 iterations",
+        f"features on cpu: {Estimate(1176, 90.0).describe(100)}",
+        "workers: 2 nodes, 4 cores",
+    ):
+        notes.emit(logging.LogRecord("lexsplat", 25, "", 0, message, (), None))
+    assert notes.told == {"reconstruct": 125.0, "features": 9000.0}
+    notes.emit(
+        logging.LogRecord(
+            "lexsplat", 25, "", 0, f"features on cpu: {Estimate(12, 1.2).describe(50)}", (), None
+        )
+    )
+    assert notes.told["features"] == 60.0

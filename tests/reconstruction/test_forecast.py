@@ -25,7 +25,11 @@ def test_the_forecast_is_the_sum_over_the_steps_and_leaves_the_training_alone(ti
     monkeypatch.setattr(Reconstructor, "step", timed)
     monkeypatch.setattr("time.perf_counter", lambda: clock[0])
     state = torch.get_rng_state()
-    found = forecasting.forecast(capture, config, points, memory=1 << 30)
+    events = []
+    found = forecasting.forecast(capture, config, points, memory=1 << 30, listener=events.append)
+    done = [event.done for event in events]
+    assert done == sorted(done)
+    assert (done[0], done[-1], events[0].total) == (0, 24, 24)
     assert torch.equal(torch.get_rng_state(), state)
     view = capture.train_views[0].camera
     counts = forecasting._counts(config, len(points.points), config.cap(torch.device("cpu")))

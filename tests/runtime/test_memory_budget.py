@@ -133,9 +133,6 @@ def test_memory_does_not_affect_the_result():
 LIBRARIES = 320 * MEGABYTE
 """Address space that linear algebra libraries and stacks of threads reserve, most of it never touched."""
 
-SLACK = 32 * MEGABYTE
-"""What may be resident beyond the numbers of `lexsplat.runtime.memory`: heaps not given back, code that is loaded."""
-
 
 @pytest.fixture(scope="module")
 def limited(tmp_path_factory):
@@ -170,7 +167,7 @@ def limited(tmp_path_factory):
 def test_a_stage_comes_through_under_a_hard_limit_and_takes_what_its_function_says(limited, stage, expected):
     report = limited[stage]
     assert expected in report["said"], report
-    assert report["resident"] < report["memory"] + SLACK
+    assert report["resident"] < report["memory"] + limited_stages.SLACK
 
 
 def test_the_photos_of_the_limited_stages_exceed_the_budget_and_the_limit(limited):

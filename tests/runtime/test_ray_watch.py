@@ -14,8 +14,9 @@ pytestmark = pytest.mark.slow
 
 ENDS = """
 import os, sys
-from lexsplat.runtime.ray_watch import HeadWatch
-with HeadWatch("127.0.0.1:PORT"):
+from lexsplat.runtime import ray_watch
+ray_watch.WITNESS_SECONDS = 2
+with ray_watch.HeadWatch("127.0.0.1:PORT"):
     END
 """
 

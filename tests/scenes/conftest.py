@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from lexsplat.scenes.library import Library
 
 
@@ -18,3 +20,15 @@ def demo_library(tmp_path_factory) -> Library:
     library = Library.create(tmp_path_factory.mktemp("demo") / "library")
     library.add("demo")
     return library
+
+
+@pytest.fixture(scope="session")
+def published_demo(made_once) -> Path:
+    """The folder of the published bundled scene; read-only."""
+    from lexsplat.scenes.publishing import PublishOptions, publish
+    from lexsplat.scenes.scene import open_scene
+
+    return made_once(
+        "published_demo",
+        lambda target: publish(open_scene("demo"), target, PublishOptions(title="A table top")),
+    )

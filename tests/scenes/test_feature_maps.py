@@ -56,5 +56,7 @@ def test_the_picture_and_the_map_are_written_for_each_view(scene, tmp_path):
     assert torch.equal(stored, feature_map(scene, view).half())
     pixels = np.asarray(Image.open(written[view]["picture"])) / 255
     np.testing.assert_allclose(pixels, feature_picture(scene, view), atol=0.5 / 255 + 1e-6)
+    colors = code_colors(scene.field)
+    assert torch.equal(feature_picture(scene, view, colors), feature_picture(scene, view))
     with pytest.raises(QueryError, match="name of a view"):
         write_features(scene, ["nothing"], tmp_path)

@@ -282,7 +282,11 @@ def test_a_library_that_moved_with_its_scenes_finds_them(rooms_copy):
     moved = rooms_copy.rename(rooms_copy.with_name("elsewhere"))
     library = Library(moved / "library")
     assert hits(library, "vase") == ["kitchen"]
+    events = []
+    library.listener = events.append
     assert library.verify() == {}
+    steps = [(event.stage, event.done) for event in events]
+    assert steps == [("verify", done) for done in range(len(library.names()) + 1)]
 
 
 def test_a_scene_that_moved_alone_is_reported_and_added_under_its_name(rooms_copy):

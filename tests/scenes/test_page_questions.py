@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 from questions import questions
-from support.page_browser import CHROMIUM, ask, chromium, open_page, serving, until
+from support.page_browser import CHROMIUM, ask, open_page, serving, until
 
 from lexsplat.queries.phrases import Anything, Both, Colored, Thing, Together, parts_of
-from lexsplat.scenes.publishing import PublishOptions, publish
 from lexsplat.scenes.scene import Scene, open_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
@@ -55,11 +54,8 @@ def demo() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def page(demo, tmp_path_factory) -> Iterator[Any]:
-    pytest.importorskip("playwright.sync_api")
-    folder = tmp_path_factory.mktemp("published") / "demo"
-    publish(demo, folder, PublishOptions())
-    with chromium() as browser, serving(folder) as address:
+def page(browser, published_demo) -> Iterator[Any]:
+    with serving(published_demo) as address:
         yield open_page(browser, address, 900, 600)
 
 

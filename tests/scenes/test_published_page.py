@@ -56,13 +56,6 @@ def demo() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def published_demo(demo, tmp_path_factory):
-    target = tmp_path_factory.mktemp("published") / "demo"
-    publish(demo, target, PublishOptions(title="A table top"))
-    return target
-
-
-@pytest.fixture(scope="module")
 def address(published_demo) -> Iterator[str]:
     with serving(published_demo) as found:
         yield found

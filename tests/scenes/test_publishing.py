@@ -84,6 +84,14 @@ def test_the_manifest_lists_every_file_with_its_checksum(scene_of_balls, tmp_pat
     )
 
 
+def test_progress_counts_the_parts_of_the_page(scene_of_balls, tmp_path, small_dictionary, monkeypatch):
+    events = []
+    monkeypatch.setattr(scene_of_balls, "listener", events.append)
+    published(scene_of_balls, tmp_path / "page", words_only=True)
+    steps = [(event.done, event.total) for event in events if event.stage == "page"]
+    assert steps == [(done, 6) for done in range(7)]
+
+
 def test_the_splats_are_an_spz_in_the_order_of_the_codes(scene_of_balls, tmp_path, monkeypatch):
     monkeypatch.setattr(splat_file, "SMALL_BYTES", 0)
     path, rotation = splat_file.write_splats(scene_of_balls.gaussians, tmp_path)

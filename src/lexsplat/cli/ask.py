@@ -44,13 +44,14 @@ class Ask:
 
     def run(self) -> None:
         """Answer."""
+        from lexsplat.cli.waiting import LateProgress
         from lexsplat.scenes.answers import find_phrase
         from lexsplat.scenes.serving import OpenScene, answer_line, json_line, lines_of, sentence
 
         note_hidden_demo(self.scene)
         # Where a terminal has other letters, "\\u1f34e" stands for an apple; lone surrogates stay valid JSON.
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
-        served = OpenScene(self.scene, self.device, self.clip)
+        served = OpenScene(self.scene, self.device, self.clip, LateProgress())
         for phrase in self.phrases:
             print(sentence(find_phrase(served.scene, phrase), served.scene.world.meters_per_unit))
         if not self.stdin:

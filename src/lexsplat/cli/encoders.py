@@ -8,7 +8,9 @@ from typing import Annotated, Any, ClassVar, Literal
 import tyro
 
 from lexsplat.cli.options import Device, print_json
+from lexsplat.cli.waiting import LateProgress
 from lexsplat.features.encoders import DEFAULT_CLIP
+from lexsplat.runtime.progress import Event
 
 _PHOTOS, _SIZE = 100, (1440, 1080)
 """What the time is stated for if no capture is given."""
@@ -62,12 +64,19 @@ class EncodersCommand:
             photos, size = survey.count, survey.size
         model_folder(config.clip, "clip")  # downloads it: its architecture decides the settings
         config = config.resolved(choose_device(self.device), size)
+        progress = LateProgress()
+        progress(Event("encoders", 0, 4))
         encoders = Encoders(config.clip, config.dino, config.encoder_device)
-        facts: dict[str, Any] = {"clip": _facts(encoders.clip) | {"words_ranked": check_words(encoders.clip)}}
+        clip = encoders.clip
+        progress(Event("encoders", 1, 4))
+        facts: dict[str, Any] = {"clip": _facts(clip) | {"words_ranked": check_words(clip)}}
+        progress(Event("encoders", 2, 4))
         if encoders.dino is not None:
             check_dense(encoders.dino)
             facts["dino"] = _facts(encoders.dino)
-        found = estimate(encoders.clip, encoders.dino, config.features, size)
+        progress(Event("encoders", 3, 4))
+        found = estimate(clip, encoders.dino, config.features, size)
+        progress(Event("encoders", 4, 4))
         facts["time"] = {
             "device": config.encoder_device,
             "crops_per_photo": found.crops,

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import tyro
 
 from lexsplat.cli.options import Device, check_phrases, print_json
+from lexsplat.cli.waiting import LateProgress
 from lexsplat.runtime.errors import FileFormatError, LibraryError, ModelError, SceneFolderError
+from lexsplat.runtime.progress import Event
 
 if TYPE_CHECKING:
     from lexsplat.scenes.library import Found, Library
@@ -88,6 +90,7 @@ class LibraryCommand:
         mends = self.repair and (self.library / "scenes").is_dir()
         make = Library.create if self.action == "add" or mends else Library
         library = make(self.library, self.device, self.index)
+        library.listener = LateProgress()
         document = getattr(self, f"_{self.action}")(library)
         if self.json:
             print_json({"library": str(self.library), **document})
@@ -113,7 +116,8 @@ class LibraryCommand:
 
     def _add(self, library: Library) -> dict[str, Any]:
         records, failed = [], []
-        for path in self.words:
+        for done, path in enumerate(self.words):
+            library.listener(Event("scenes", done, len(self.words)))
             try:
                 record = library.add(path)
             except (SceneFolderError, FileFormatError, ModelError) as error:
@@ -124,6 +128,7 @@ class LibraryCommand:
                 continue
             records.append(dataclasses.asdict(record))
             self._say(f"{record.name}: added from {record.path}, {record.codes} codes of {record.clip}")
+        library.listener(Event("scenes", len(self.words), len(self.words)))
         return {"scenes": records, "failed": failed}
 
     def _remove(self, library: Library) -> dict[str, Any]:

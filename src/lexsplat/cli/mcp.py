@@ -6,12 +6,15 @@ import dataclasses
 import importlib.util
 import threading
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
 from lexsplat.cli.options import Device
 from lexsplat.runtime.errors import BackendError, LibraryError
+
+if TYPE_CHECKING:
+    import socket
 
 Scenes = tyro.conf.Positional[
     Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE ...", help_behavior_hint="(required)")]
@@ -66,6 +69,17 @@ class Mcp:
             raise BackendError(
                 "lexsplat mcp", expected="the package mcp", found="none", remedy='pip install "lexsplat[mcp]"'
             )
+        if not self.http:
+            self._serve(None)
+            return
+        from lexsplat.runtime.listening import listen
+
+        with listen(
+            self.host, self.port
+        ) as listening:  # first: a taken port is refused before anything is loaded
+            self._serve(listening)
+
+    def _serve(self, listening: socket.socket | None) -> None:
         from lexsplat.mcp.server import make_server, serve_http
         from lexsplat.mcp.writing import check_output
         from lexsplat.scenes.library import open_library
@@ -82,7 +96,7 @@ class Mcp:
         server = make_server(scenes, self.output.resolve() if self.allow_write else None, library)
         for served in scenes.values():  # meanwhile the client connects; the process ends after them
             threading.Thread(target=served.warm).start()
-        if self.http:
-            serve_http(server, self.host, self.port, self.token)
-        else:
+        if listening is None:
             server.run()
+        else:
+            serve_http(server, listening, self.host, self.token)

@@ -7,7 +7,6 @@ import math
 
 from lexsplat.cli.options import Device, SceneArgument, open_folder, open_scene, print_json
 from lexsplat.cli.values import Length
-from lexsplat.geometry.world import World, parse_vector, world_of
 
 
 @dataclasses.dataclass
@@ -54,6 +53,10 @@ class Scale:
             )
         if self.distance is not None and not 0 < self.distance < float("inf"):
             raise ValueError(f"distance must be positive, got {self.distance:g}")
+        if self.points is None and self.up is None:
+            return
+        from lexsplat.geometry.world import World, parse_vector
+
         for text in self.points or ():
             parse_vector(text)
         if self.up is not None:
@@ -61,6 +64,7 @@ class Scale:
 
     def run(self) -> None:
         """Measure, store and print."""
+        from lexsplat.geometry.world import parse_vector, world_of
         from lexsplat.scenes.scale import store_world
 
         folder = open_folder(self.scene)
@@ -87,6 +91,7 @@ class Scale:
 
     def _length(self, folder: str) -> float:
         """The given distance as it is in the scene, in world units."""
+        from lexsplat.geometry.world import parse_vector
         from lexsplat.scenes.scale import height_of, length_between, positive_length
 
         if self.points is not None:

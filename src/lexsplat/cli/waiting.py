@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import threading
 import time
 from typing import TYPE_CHECKING
 
@@ -16,27 +18,57 @@ _PATIENCE = 2.0
 class LateProgress:
     """A listener that shows a stage if it is not finished after two seconds, and nothing before.
 
+    A timer shows it also where the stage sends no event meanwhile. Stages may contain stages.
+
     Args:
         patience: Seconds without anything shown.
     """
 
     def __init__(self, patience: float = _PATIENCE) -> None:
         self._patience = patience
-        self._starts: dict[str, float] = {}
+        self._lock = threading.RLock()
+        self._starts: dict[str, float] = {}  # of unfinished stages, in the order in which they began
+        self._latest: dict[str, Event] = {}
+        self._timer: threading.Timer | None = None
         self._bars: ProgressBars | None = None
+        atexit.register(self._close)
 
     def __call__(self, event: Event) -> None:
         """Receive one event."""
-        start = self._starts.setdefault(event.stage, time.monotonic())
-        finished = event.done >= event.total
-        if self._bars is None and not finished and time.monotonic() - start >= self._patience:
-            from lexsplat.cli.progress import ProgressBars
+        with self._lock:
+            if event.done == 0:
+                self._starts.pop(event.stage, None)  # it starts anew
+            now = time.monotonic()
+            start, finished = self._starts.setdefault(event.stage, now), event.done >= event.total
+            self._latest[event.stage] = event
+            if self._bars is not None:
+                self._bars(event)
+            elif not finished and now - start >= self._patience:
+                self._show()
+            elif not finished and self._timer is None:
+                self._timer = threading.Timer(self._patience, self._show)
+                self._timer.daemon = True
+                self._timer.start()
+            if finished:
+                self._starts.pop(event.stage)
+                if not self._starts:
+                    self._close()
 
-            self._bars = ProgressBars().__enter__()
-        if self._bars is not None:
-            self._bars(event)
-        if finished:
-            del self._starts[event.stage]
-        if finished and self._bars is not None:
-            self._bars.__exit__(None, None, None)
-            self._bars = None
+    def _show(self) -> None:
+        """Show what is not finished."""
+        from lexsplat.cli.progress import ProgressBars
+
+        with self._lock:
+            if self._starts and self._bars is None:
+                self._bars = ProgressBars().__enter__()
+                for stage in self._starts:
+                    self._bars(self._latest[stage])
+
+    def _close(self) -> None:
+        with self._lock:
+            if self._timer is not None:
+                self._timer.cancel()
+                self._timer = None
+            if self._bars is not None:
+                self._bars.__exit__(None, None, None)
+                self._bars = None

@@ -104,6 +104,7 @@ def evaluate(
 
         found = load_annotations(capture)
         ground_truth = GroundTruth(found.masks, found.boxes)
+    listener(Event("evaluate", 0, len(capture.test_names)))
     run = _Evaluation(capture, scene, config, ground_truth)
     quality = run.run(observer, listener)
     words = summarize_language(run.pairs, run.thresholds)

@@ -18,9 +18,9 @@ from lexsplat.pipeline.inputs import reload_capture
 from lexsplat.runtime.environment import machine_facts
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path, read_json, write_json
-from lexsplat.runtime.progress import Listener, silent
+from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.answers import file_name
-from lexsplat.scenes.feature_maps import feature_picture
+from lexsplat.scenes.feature_maps import code_colors, feature_picture
 from lexsplat.scenes.previous import require_current
 from lexsplat.scenes.scene import Scene
 
@@ -84,8 +84,10 @@ def evaluate_scene(
         },
         machine=machine_facts(),
     )
-    for view in gallery.views:
-        gallery.add_features(view, feature_picture(scene, view).cpu().numpy())
+    colors = code_colors(scene.field)
+    for done, view in enumerate(gallery.views):
+        listener(Event("report", done, len(gallery.views)))
+        gallery.add_features(view, feature_picture(scene, view, colors).cpu().numpy())
     result = metrics.to_json()
     write_json(folder.root / "metrics.json", result)
     write_rows(folder.root, "metrics", table_rows({title: result}))
@@ -95,6 +97,7 @@ def evaluate_scene(
         path = folder.root / "heatmaps" / file_name(prompt) / stem.with_name(stem.name + ".jpg")
         with atomic_path(path) as temporary:
             temporary.write_bytes(images["heatmap"])
+    listener(Event("report", len(gallery.views), len(gallery.views)))
     return result
 
 

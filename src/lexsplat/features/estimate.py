@@ -6,15 +6,19 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from lexsplat.features.checks import bundled_images
 from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
-from lexsplat.features.extraction import encoded_size
-from lexsplat.features.pyramid import grid_levels, unique_boxes
+from lexsplat.features.extraction import cpu_batch, encoded_size, parallel_views
+from lexsplat.features.pretrained import resize_images
+from lexsplat.features.pyramid import cut_crops, encode_stream, grid_levels, random_levels, unique_boxes
 from lexsplat.features.settings import FeatureConfig
 
-_SHORT = 1.0  # seconds below which a measurement is repeated with more crops
-_MOST_CROPS = 192
+_SHORT = 0.5  # seconds below which a measurement is repeated with more crops
+_MOST_CROPS = 256
+_IMAGE = 256  # side of the bundled image that is resized to a photo
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,9 @@ class Estimate:
 def estimate(
     clip: ImageTextEncoder, dino: DenseEncoder | None, config: FeatureConfig, capture_size: tuple[int, int]
 ) -> Estimate:
-    """Measure the encoders on bundled images and scale the time to a photo.
+    """Cut and encode some crops as the extraction does, and scale the time to a photo.
+
+    On the CPU several photos are processed at once; the time of one is that of all of them divided by their number.
 
     Args:
         clip: Encoder of the crops.
@@ -52,29 +58,49 @@ def estimate(
         config: Settings of the features.
         capture_size: Width and height of a photo.
     """
-    crops = count_crops(config, capture_size)
-    encode = clip.encode_images if config.tokens == "class" else clip.encode_patches
-    images = bundled_images(clip.image_size)
-    encode(images[:1])  # the first call takes longer
-    while True:
+    threads, photos = torch.get_num_threads(), parallel_views(clip.device)
+    torch.set_num_threads(max(1, threads // photos))
+    try:
+        seconds = _crop_seconds(clip, config, capture_size) * count_crops(config, capture_size)
+        if dino is not None:
+            seconds += _dense_seconds(dino, config, capture_size)
+    finally:
+        torch.set_num_threads(threads)
+    return Estimate(count_crops(config, capture_size), seconds / photos)
+
+
+def _crop_seconds(clip: ImageTextEncoder, config: FeatureConfig, capture_size: tuple[int, int]) -> float:
+    """Seconds of one crop by one worker."""
+    boxes, (width, height) = _boxes(config, capture_size), encoded_size(capture_size, config)
+    image = resize_images(bundled_images(_IMAGE)[:1], height, width)[0].to(clip.device)
+    batch, count = cpu_batch(clip.image_size), 1
+    encode = clip.encode_images if config.tokens == "class" else lambda crops: clip.encode_patches(crops)[0]
+
+    def measure(count: int) -> float:
+        chosen = boxes[np.linspace(0, len(boxes) - 1, count).round().astype(int)]
         start = time.perf_counter()
-        encode(images)
-        seconds = time.perf_counter() - start
-        if seconds > _SHORT or len(images) >= _MOST_CROPS:
-            break
-        images = images.repeat(4, 1, 1, 1)[:_MOST_CROPS]
-    total = crops * seconds / len(images)
-    if dino is not None:
-        total += _dense_seconds(dino, config, capture_size)
-    return Estimate(crops, total)
+        list(encode_stream(encode, [((), cut_crops(image, chosen, clip.image_size, batch))], batch))
+        return time.perf_counter() - start
+
+    measure(count)  # the first call takes longer
+    count = batch
+    while (seconds := measure(count)) < _SHORT and count < _MOST_CROPS:
+        count = min(_MOST_CROPS, 4 * count)
+    return seconds / count
+
+
+def _boxes(config: FeatureConfig, capture_size: tuple[int, int]) -> NDArray[np.int32]:
+    """The crops of a photo of this width and height ``[n, 3]``."""
+    size = encoded_size(capture_size, config)
+    if config.mode == "grid":
+        return unique_boxes(grid_levels(*size, config.crop_sizes, config.crop_strides))[0]
+    sides = np.linspace(*config.random_sizes, config.random_levels).tolist()
+    return unique_boxes(random_levels(*size, sides, config.random_crops, np.random.default_rng(0)))[0]
 
 
 def count_crops(config: FeatureConfig, capture_size: tuple[int, int]) -> int:
     """Number of crops of a photo of this width and height."""
-    if config.mode == "random":
-        return config.random_crops
-    levels = grid_levels(*encoded_size(capture_size, config), config.crop_sizes, config.crop_strides)
-    return len(unique_boxes(levels)[0])
+    return config.random_crops if config.mode == "random" else len(_boxes(config, capture_size))
 
 
 def _dense_seconds(dino: DenseEncoder, config: FeatureConfig, capture_size: tuple[int, int]) -> float:

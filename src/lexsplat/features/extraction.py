@@ -94,9 +94,7 @@ def extract_features(
     done, total = len(entries) - len(missing), len(entries)
     listener(Event("features", done, total))
     largest = max([1, *(_view_bytes(capture.views[n], entries[n], clip, config, memory) for n in entries)])
-    workers = (
-        min(_MAX_WORKERS, torch.get_num_threads(), max(1, len(missing))) if clip.device.type == "cpu" else 1
-    )
+    workers = min(parallel_views(clip.device), max(1, len(missing)))
     workers = max(1, min(workers, memory // 2 // largest))
     same_files: dict[tuple[Path, Path | None], list[str]] = {}  # views of identical photos share their files
     for name in missing:
@@ -164,6 +162,16 @@ def load_level_maps(
     """
     entry = _Entry.of(capture.views[name], clip, None, config, Path(cache_dir))
     return read_levels(entry.clip, *entry.map_size)
+
+
+def parallel_views(device: torch.device) -> int:
+    """Number of views that are processed at once, if memory suffices."""
+    return min(_MAX_WORKERS, torch.get_num_threads()) if device.type == "cpu" else 1
+
+
+def cpu_batch(image_size: int) -> int:
+    """Number of crops of this side that a CPU encodes at once."""
+    return min(_CPU_BATCH, max(1, _CPU_PIXELS // image_size**2))
 
 
 def encoded_size(capture_size: tuple[int, int], config: FeatureConfig) -> tuple[int, int]:
@@ -248,7 +256,7 @@ class _Extraction:
         self.views, self.entries, self.clip, self.dino, self.config = views, entries, clip, dino, config
         self.batch_size = batch_size
         if clip.device.type == "cpu":
-            self.batch_size = min(batch_size, _CPU_BATCH, max(1, _CPU_PIXELS // clip.image_size**2))
+            self.batch_size = min(batch_size, cpu_batch(clip.image_size))
         self._todo: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._finished: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._stop = threading.Event()

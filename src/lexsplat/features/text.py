@@ -6,6 +6,7 @@ import json
 import logging
 import os
 from collections.abc import Callable, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Protocol
 
@@ -113,6 +114,7 @@ class TextCache:
             found = {}  # one of the files was made by something else
         new = [prompt for prompt in wanted if prompt not in found]
         if new:
+            listener(Event("words", 0, len(new)))  # before the model is loaded
             model = encoder()
             if model.content_hash != content_hash:
                 raise ValueError(f"{model.content_hash} is not the model of the features ({content_hash})")
@@ -147,11 +149,13 @@ class _Store:
     def add(self, content_hash: str, found: dict[str, Tensor]) -> None:
         """Store new texts, and drop the oldest ones if there are too many."""
         known, width = self.read(content_hash), len(next(iter(found.values())))
-        if any(len(vector) != width for vector in known.values()):
+        if any(len(vector) != width for vector in islice(known.values(), 1)):  # all are as wide as the first
             known.clear()
         new = {text: v for text, v in found.items() if text not in known and len(text) <= _MAX_LENGTH}
+        if not new:
+            return
         place = next(folder for folder in (self._folder, *self._folder.parents) if folder.exists())
-        if not new or not os.access(place, os.W_OK):
+        if not os.access(place, os.W_OK):
             return
         known.update(new)
         for text in list(known)[:-_MAX_STORED]:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
+from lexsplat.runtime.progress import Event, Listener, silent
 
 _NEIGHBORS = 10
 _COLOR = 0.2
@@ -36,6 +37,11 @@ _MOST = 20_000
 _COARSEST = 20
 """No level has fewer segments, unless the lowest has."""
 _LINKS_AT_ONCE = 1 << 16
+STAGE = "segments"
+_MERGE_UNITS = 10
+"""Units of progress of the merging of segments."""
+_REPORTED = 256
+"""Merges between two reports."""
 _PREFIX = "segments."
 
 FloatArray = NDArray[np.float64]
@@ -105,13 +111,16 @@ Rows = Callable[[slice | Tensor], Tensor]
 """Language features of some Gaussians ``[n, D]``, of any length."""
 
 
-def make_segments(gaussians: Gaussians, features: Rows, masses: Tensor) -> Segments:
+def make_segments(
+    gaussians: Gaussians, features: Rows, masses: Tensor, listener: Listener = silent
+) -> Segments:
     """The segments of a scene. Runs on the CPU; the result does not depend on the number of threads.
 
     Args:
         gaussians: The geometry and colors.
         features: Their mean language features, 0 where no view shows them.
         masses: Their visible weights over the training views ``[N]``.
+        listener: Receives events of stage "segments": one unit per block of links, then those of merging.
     """
     from lexsplat.language.segment_kernels import join_linked
 
@@ -121,11 +130,15 @@ def make_segments(gaussians: Gaussians, features: Rows, masses: Tensor) -> Segme
         return Segments(torch.zeros(count, dtype=torch.int64), masses.cpu(), torch.zeros(1, 1).long())
     colors = (0.5 + SH_C0 * gaussians.sh0[:, 0].detach()).clamp(0, 1).cpu().double().numpy()
     means = gaussians.means.detach().cpu().double().numpy()
+    listener(Event(STAGE, 0, 1))
     first, second = _links(means, min(_NEIGHBORS, count - 1))
-    language = np.concatenate([
-        _language_distances(features, first[start : start + _LINKS_AT_ONCE], second[start : start + _LINKS_AT_ONCE])
-        for start in range(0, len(first), _LINKS_AT_ONCE)
-    ])  # fmt: skip
+    parts, blocks = [], range(0, len(first), _LINKS_AT_ONCE)
+    total = len(blocks) + _MERGE_UNITS
+    for done, start in enumerate(blocks):
+        listener(Event(STAGE, done, total))
+        block = slice(start, start + _LINKS_AT_ONCE)
+        parts.append(_language_distances(features, first[block], second[block]))
+    language = np.concatenate(parts)
     color = ((colors[first] - colors[second]) ** 2).sum(1)
     lengths = language / max(language.mean(), 1e-12) + _COLOR * color / max(color.mean(), 1e-12)
     order = np.argsort(lengths, kind="stable")
@@ -136,9 +149,15 @@ def make_segments(gaussians: Gaussians, features: Rows, masses: Tensor) -> Segme
     )[1]
     described = _describe(labels, features, colors, weights)
     segments = int(labels.max()) + 1
-    merges = _merge(*described, labels[first], labels[second])
+    listener(Event(STAGE, len(blocks), total))
+
+    def merged(share: float) -> None:
+        listener(Event(STAGE, min(len(blocks) + int(share * _MERGE_UNITS), total - 1), total))
+
+    merges = _merge(*described, labels[first], labels[second], merged)
     counts = [segments >> level for level in range(32) if level == 0 or segments >> level >= _COARSEST]
     levels = np.stack([_cut(segments, merges, number) for number in counts])
+    listener(Event(STAGE, total, total))
     return Segments(torch.from_numpy(labels), masses.detach().cpu().float(), torch.from_numpy(levels))
 
 
@@ -195,8 +214,17 @@ def _describe(
     return np.concatenate(described, 1), masses
 
 
-def _merge(means: FloatArray, masses: FloatArray, first: IntArray, second: IntArray) -> list[tuple[int, int]]:
-    """Merges of neighboring segments, the closest first: merge t joins two nodes to node S + t."""
+def _merge(
+    means: FloatArray,
+    masses: FloatArray,
+    first: IntArray,
+    second: IntArray,
+    report: Callable[[float], None],
+) -> list[tuple[int, int]]:
+    """Merges of neighboring segments, the closest first: merge t joins two nodes to node S + t.
+
+    Reports the share of the merges that are done.
+    """
     count = len(means)
     means = np.concatenate([means, np.zeros_like(means)])
     masses = np.concatenate([masses, np.zeros_like(masses)])
@@ -219,6 +247,8 @@ def _merge(means: FloatArray, masses: FloatArray, first: IntArray, second: IntAr
             continue
         node = count + len(merges)
         merges.append((a, b))
+        if len(merges) % _REPORTED == 0:
+            report(len(merges) / count)
         alive.difference_update((a, b))
         alive.add(node)
         masses[node] = masses[a] + masses[b]

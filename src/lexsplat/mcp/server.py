@@ -7,6 +7,7 @@ import hmac
 import inspect
 import json
 import logging
+import socket
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -26,7 +27,6 @@ from lexsplat.mcp.lines import messages
 from lexsplat.mcp.tools import Reply, Tools
 from lexsplat.mcp.writing import WritingTools
 from lexsplat.runtime.errors import LexsplatError, QueryError
-from lexsplat.runtime.listening import listen
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.serving import OpenScene, error_document
 
@@ -143,19 +143,22 @@ def _protocol_error(error: LexsplatError) -> MCPError:
     return MCPError(INVALID_PARAMS, str(error), error_document(error))
 
 
-def serve_http(server: MCPServer, host: str, port: int, token: str | None) -> None:
+def serve_http(server: MCPServer, listening: socket.socket, host: str, token: str | None) -> None:
     """Serve over Streamable HTTP at ``/mcp`` until Ctrl-C.
 
     Host and Origin must be this machine's. Bound elsewhere, each request needs the token.
 
-    Raises:
-        BackendError: If the address is not of this machine, or the port is taken.
+    Args:
+        server: The server.
+        listening: Where it listens (`lexsplat.runtime.listening.listen`).
+        host: The address that was bound.
+        token: What each request must send; None needs none.
     """
     import uvicorn
 
-    with listen(host, port) as listening:
-        settings = uvicorn.Config(http_app(server, host, token), host=host, port=port, log_level="warning")
-        uvicorn.Server(settings).run([listening])
+    port = listening.getsockname()[1]
+    settings = uvicorn.Config(http_app(server, host, token), host=host, port=port, log_level="warning")
+    uvicorn.Server(settings).run([listening])
 
 
 def http_app(server: MCPServer, host: str, token: str | None) -> Callable[..., Any]:

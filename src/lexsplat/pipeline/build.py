@@ -115,7 +115,7 @@ def build(
             checked: Encoders | None = None
             if photos is not None and encodes:
                 sized = config.resolved(device, photos.size)
-                checked = check_encoders(sized, source or splats, photos.count, photos.size)
+                checked = check_encoders(sized, source or splats, photos.count, photos.size, listener)
             if source is None:
                 capture = capture_of_splats(splats, folder, config, device, listener)
             else:
@@ -200,7 +200,8 @@ class _Builder:
         encodes = "features" in wanted and self.encoders is None
         if encodes and not self._is_finished("features", stages["features"]):
             sizes = [view.capture_size for view in self._training_views.values()]
-            self.encoders = check_encoders(self.config, self.capture.root, len(sizes), max(sizes))
+            source = self.capture.root
+            self.encoders = check_encoders(self.config, source, len(sizes), max(sizes), self.listener)
         for name in wanted:
             self._run_stage(name, stages[name])
         if until == "language":

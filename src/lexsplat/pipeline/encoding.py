@@ -14,12 +14,13 @@ from lexsplat.features.checks import ENOUGH, check_dense, rank_words
 from lexsplat.features.clip import check_patches
 from lexsplat.features.clip_text import UNLIKE_WORDS
 from lexsplat.features.estimate import estimate
+from lexsplat.features.extraction import missing_views
 from lexsplat.features.hub import model_folder
 from lexsplat.features.masking import without_masked_cells
 from lexsplat.features.segments2d import load_segmenter, pooled_features
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.memory import parse_bytes
-from lexsplat.runtime.progress import NOTE, Listener, silent
+from lexsplat.runtime.progress import NOTE, Event, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from lexsplat.features.text import TextTower
 
 log = logging.getLogger("lexsplat")
+
+_TOLD_FROM = 12
+"""Photos from which the time is told that no check has told; measuring it takes as long as about one."""
 
 
 BUNDLED_SCENES = Path(__file__).resolve().parents[1] / "demo"
@@ -46,6 +50,7 @@ class Encoders:
     def __init__(self, clip: str, dino: str, device: str, segments: str = "none") -> None:
         self._clip_name, self._dino_name, self._segments, self.device = clip, dino, segments, device
         self.text: TextTower | None = None
+        self.told = False  # whether the time of the features is logged
 
     @classmethod
     def of(cls, config: BuildConfig) -> Encoders:
@@ -92,7 +97,11 @@ def fetch_clip(config: BuildConfig) -> None:
 
 
 def check_encoders(
-    config: BuildConfig, source: Path | None = None, photos: int = 0, size: tuple[int, int] = (1440, 1080)
+    config: BuildConfig,
+    source: Path | None = None,
+    photos: int = 0,
+    size: tuple[int, int] = (1440, 1080),
+    listener: Listener = silent,
 ) -> Encoders:
     """Load the encoders of the settings, check them, and log how long the features will take.
 
@@ -103,6 +112,7 @@ def check_encoders(
         source: The capture, to which bundled encoders must suit; None is not checked.
         photos: Number of photos.
         size: Width and height of a photo.
+        listener: Receives events of stage "encoders": loaded, checked with words, the dense one checked, timed.
 
     Returns:
         The encoders, loaded as far as they were checked.
@@ -130,7 +140,11 @@ def check_encoders(
     if config.clip == "bundled" and config.dino in ("bundled", "none"):
         return encoders
     log.log(NOTE, "the encoders are loaded, checked and timed")
-    right = rank_words(encoders.clip)
+    listener(Event("encoders", 0, 4))
+    clip = encoders.clip
+    listener(Event("encoders", 1, 4))
+    right = rank_words(clip)
+    listener(Event("encoders", 2, 4))
     if right < ENOUGH:
         # Only a warning: an encoder may be made for other things than the bundled images show.
         log.warning(
@@ -141,10 +155,25 @@ def check_encoders(
         )
     if encoders.dino is not None:
         check_dense(encoders.dino)
+    listener(Event("encoders", 3, 4))
     if photos:
         found = estimate(encoders.clip, encoders.dino, config.features, size)
         log.log(NOTE, "features on %s: %s", config.encoder_device, found.describe(photos))
+        encoders.told = True
+    listener(Event("encoders", 4, 4))
     return encoders
+
+
+def _tell_time(capture: Capture, config: BuildConfig, encoders: Encoders, cache_dir: Path) -> None:
+    """Log how long the features of the views that are not cached will take; nothing for a few seconds."""
+    clip, dino, settings = encoders.clip, encoders.dino, config.features
+    missing = missing_views(capture, clip, dino, settings, cache_dir)
+    if len(missing) < _TOLD_FROM:
+        return
+    sizes = [capture.views[name].capture_size for name in missing]
+    found = estimate(clip, dino, settings, max(sizes, key=lambda size: size[0] * size[1]))
+    log.log(NOTE, "features on %s: %s", config.encoder_device, found.describe(len(missing)))
+    encoders.told = True
 
 
 def feature_maps(
@@ -169,6 +198,8 @@ def feature_maps(
     memory = parse_bytes(config.memory)
     if config.features_from is None:
         clip, dino = encoders.clip, encoders.dino
+        if not encoders.told:
+            _tell_time(capture, config, encoders, cache_dir)
         maps = extract_features(
             capture, clip, dino, config.features, cache_dir=cache_dir, memory=memory, listener=listener
         )

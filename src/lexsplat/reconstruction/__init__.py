@@ -75,7 +75,7 @@ def reconstruct(
     if few and points.origin != "random":
         points = points_between(capture, points, seed)
     if config.iterations >= _FORECAST_FROM:
-        seconds = round(forecast(capture, config, points, device=device, memory=memory))
+        seconds = round(forecast(capture, config, points, device=device, memory=memory, listener=listener))
         length = f"{seconds // 60}:{seconds % 60:02} min"
         log.log(NOTE, "reconstruct: about %s for %s iterations", length, f"{config.iterations:,}")
     trainer = Reconstructor(capture, config, points, device=device, seed=seed, memory=memory)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -12,10 +13,13 @@ from numpy.typing import NDArray
 
 from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.reconstruction.trainer import Reconstructor
+from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, InitialPoints
 
+_FIRST = 2
+"""Steps that are not timed: they read photos and load kernels."""
 _STEPS = 4
 _GROWTH = {"default": 1.45, "mcmc": 1.05}
 """Factor by which a round of density control multiplies the number of Gaussians; 1.4 to 1.55 on the bundled captures
@@ -29,6 +33,7 @@ def forecast(
     *,
     device: torch.device | str = "cpu",
     memory: int,
+    listener: Listener = silent,
 ) -> float:
     """Seconds that a reconstruction will take.
 
@@ -41,32 +46,39 @@ def forecast(
         points: Initial points.
         device: Where to train.
         memory: Budget of host memory in bytes.
+        listener: Receives an event of stage "calibrate" after each untimed step and each timed row of steps.
     """
     counts = _counts(config, len(points.points), config.cap(torch.device(device)))
     grown = (counts - counts[0]) / max(1.0, counts[-1] - counts[0])
     many = _grown(points, int(counts[-1]))
+    parts = [
+        (1.0, grown[: config.warm_up_iterations]),
+        (0.0, grown[config.warm_up_iterations :]),
+    ]
+    parts = [part for part in parts if len(part[1])]
+    done, steps = itertools.count(1), 2 * len(parts) * (_FIRST + _STEPS)
+    listener(Event("calibrate", 0, steps))
 
     def per_step(start: InitialPoints, warm_up: float) -> float:
         trainer = Reconstructor(
             capture, replace(config, warm_up=warm_up), start, device=device, memory=memory
         )
-        for _ in range(2):  # the first steps read photos and load kernels
+        for _ in range(_FIRST):
             trainer.step()
+            listener(Event("calibrate", next(done), steps))
         _finish(trainer.device)
         begin = time.perf_counter()
         for _ in range(_STEPS):
             trainer.step()
         _finish(trainer.device)
-        return (time.perf_counter() - begin) / _STEPS
+        seconds = time.perf_counter() - begin
+        listener(Event("calibrate", [next(done) for _ in range(_STEPS)][-1], steps))
+        return seconds / _STEPS
 
     total = 0.0
-    for warm_up, shares in (
-        (1.0, grown[: config.warm_up_iterations]),
-        (0.0, grown[config.warm_up_iterations :]),
-    ):
-        if len(shares):
-            few, most = per_step(points, warm_up), per_step(many, warm_up)
-            total += float((few + shares * (most - few)).sum())
+    for warm_up, shares in parts:
+        few, most = per_step(points, warm_up), per_step(many, warm_up)
+        total += float((few + shares * (most - few)).sum())
     return total
 
 

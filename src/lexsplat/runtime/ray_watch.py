@@ -25,6 +25,8 @@ GRACE_SECONDS = 20.0
 """Seconds without an answer, after which the cluster counts as gone; Ray itself would end this process at 60."""
 BLOCKED_SECONDS = 15.0
 """Seconds for which a call of Ray may go on after that."""
+WITNESS_SECONDS = 20
+"""Seconds after the end of a process in which the head may go, so that the end counts as Ray's."""
 
 
 class ClusterLostError(WorkersError):
@@ -45,8 +47,8 @@ class ClusterLostError(WorkersError):
 
 _WITNESS = """
 import socket, sys, time
-host, port, line = sys.argv[1], int(sys.argv[2]), sys.argv[3]
-for _ in range(0 if sys.stdin.read() else 20):
+host, port, seconds, line = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
+for _ in range(0 if sys.stdin.read() else seconds):
     try:
         socket.create_connection((host, port), timeout=2).close()
     except OSError:
@@ -78,7 +80,8 @@ class HeadWatch:
     def __enter__(self) -> HeadWatch:
         if self._port:
             line = f"error: {ClusterLostError.by()}"
-            command = [sys.executable, "-I", "-S", "-c", _WITNESS, self._host, self._port, line]
+            facts = self._host, self._port, str(WITNESS_SECONDS), line
+            command = [sys.executable, "-I", "-S", "-c", _WITNESS, *facts]
             self._witness = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True, text=True
             )

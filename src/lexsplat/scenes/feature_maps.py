@@ -41,14 +41,20 @@ def feature_map(scene: Scene, view: str | StoredView | Camera) -> Tensor:
 
 
 @torch.no_grad()
-def feature_picture(scene: Scene, view: str | StoredView | Camera) -> Tensor:
+def feature_picture(scene: Scene, view: str | StoredView | Camera, colors: Tensor | None = None) -> Tensor:
     """The principal components of F as colors ``[H, W, 3]`` in 0..1; black where nothing is rendered.
+
+    Args:
+        scene: The scene.
+        view: Name of a view, or a camera.
+        colors: `code_colors` of its field, for several views; None computes them.
 
     Raises:
         QueryError: If the view is unknown.
     """
-    colors = code_colors(scene.field).to(scene.gaussians.device)
-    return scene.field.render_scores(scene.gaussians, scene.camera(view), colors).clamp(0, 1)
+    colors = code_colors(scene.field) if colors is None else colors
+    table = colors.to(scene.gaussians.device)
+    return scene.field.render_scores(scene.gaussians, scene.camera(view), table).clamp(0, 1)
 
 
 @torch.no_grad()
@@ -80,14 +86,14 @@ def write_features(scene: Scene, views: Sequence[str], folder: Path) -> dict[str
     Raises:
         QueryError: If a view is unknown.
     """
-    written = {}
+    written, colors = {}, code_colors(scene.field)
     for name in views:
         stem = folder / "features" / Path(name).with_suffix("")
         stored, picture = (stem.with_name(stem.name + ending) for ending in (".safetensors", ".png"))
         write_tensors(
             stored, {"features": feature_map(scene, name).half().cpu().contiguous()}, {"view": name}
         )
-        pixels = (feature_picture(scene, name) * 255).round().to(torch.uint8).cpu().numpy()
+        pixels = (feature_picture(scene, name, colors) * 255).round().to(torch.uint8).cpu().numpy()
         with atomic_path(picture) as temporary:
             Image.fromarray(pixels).save(temporary, format="PNG")
         written[name] = {"map": str(stored), "picture": str(picture)}

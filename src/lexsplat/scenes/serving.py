@@ -14,6 +14,7 @@ from typing import Any, TextIO
 
 from lexsplat.queries.spelling import corrected
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
+from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.scene import Scene, open_scene
@@ -31,17 +32,25 @@ class OpenScene:
         path: The scene folder, or the word "demo".
         device: "auto", "cpu" or "cuda".
         clip: Text encoder, if it is not where the build found it.
+        listener: Receives progress events of the scene.
 
     Raises:
         SceneFolderError: If there is no finished scene.
     """
 
-    def __init__(self, path: str | Path, device: str = "auto", clip: str | None = None) -> None:
-        self.path, self._device, self._clip = path, device, clip
+    def __init__(
+        self, path: str | Path, device: str = "auto", clip: str | None = None, listener: Listener = silent
+    ) -> None:
+        self.path, self._device, self._clip, self._listener = path, device, clip, listener
         self._lock = threading.Lock()
         self._root = SceneFolder.open(Path(path)).root
         self._state = self._stamp()  # before it is read: what changes meanwhile is read again
-        self._scene = open_scene(path, device=device, clip=clip)
+        self._scene = self._open()
+
+    def _open(self) -> Scene:
+        scene = open_scene(self.path, device=self._device, clip=self._clip)
+        scene.listener = self._listener
+        return scene
 
     def warm(self) -> None:
         """Load and compute what the first questions would wait for: the encoder, the dictionary, the objects."""
@@ -62,7 +71,7 @@ class OpenScene:
         if stamp != self._state:
             with self._lock:
                 if stamp != self._state:
-                    self._scene = open_scene(self.path, device=self._device, clip=self._clip)
+                    self._scene = self._open()
                     self._state = stamp
         return self._scene
 

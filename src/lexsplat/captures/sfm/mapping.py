@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal
 from PIL import Image
 
 from lexsplat.captures.images.reading import image_size
+from lexsplat.captures.sfm.counting import counted_pairs
 from lexsplat.captures.sfm.feature_budget import extraction_threads, matching_plan
 from lexsplat.captures.sfm.pose_agreement import misregistered, register_again
 from lexsplat.captures.sfm.pycolmap_import import pycolmap
@@ -40,6 +41,9 @@ MIN_MATCHES = 15
 """Fewest verified matches of a pair, and fewest inliers of a photo in "small angles" (pycolmap: 30)."""
 
 HAS_GLOBAL = hasattr(pycolmap, "global_mapping")
+
+Pairs = Callable[[int, int], None]
+"""Receives the number of matched pairs, and of all."""
 
 Mapper = Literal["incremental", "small angles", "global"]
 """How models are found: photo by photo, the same from pairs with small angles, or all photos at once (GLOMAP)."""
@@ -125,56 +129,69 @@ def _complete_masks(photos: PreparedPhotos, masks: Path, folder: Path) -> Path:
     return folder
 
 
-def match_photos(database: Path, count: int, config: PoseConfig, seed: int, memory: int) -> None:
+def match_photos(
+    database: Path, count: int, config: PoseConfig, seed: int, memory: int, listener: Pairs
+) -> None:
     """Match ``count`` photos, all pairs or each with the next ones, and verify the matches."""
     if config.compares_all(count):
         matching, held = matching_plan(database, memory, least=2 * budget.CACHED_BLOCKS)
-        pycolmap.match_exhaustive(
-            database,
-            matching_options=matching,
-            pairing_options=pycolmap.ExhaustivePairingOptions(
-                block_size=min(50, held // budget.CACHED_BLOCKS)
-            ),
-            verification_options=_verification(seed),
-            device=pycolmap.Device.cpu,
-        )
+        with counted_pairs(database, count * (count - 1) // 2, listener):
+            pycolmap.match_exhaustive(
+                database,
+                matching_options=matching,
+                pairing_options=pycolmap.ExhaustivePairingOptions(
+                    block_size=min(50, held // budget.CACHED_BLOCKS)
+                ),
+                verification_options=_verification(seed),
+                device=pycolmap.Device.cpu,
+            )
         return
     # Quadratic overlap adds photos 2, 4, 8, ... further on, which closes loops.
     pairing = pycolmap.SequentialPairingOptions(overlap=SEQUENTIAL_OVERLAP, quadratic_overlap=True)
     if hasattr(pairing, "loop_detection_num_images"):  # unused, but pycolmap sizes its feature cache by it
         pairing.loop_detection_num_images = 1
     matching, _ = matching_plan(database, memory, least=budget.SEQUENTIAL_BLOCKS * SEQUENTIAL_OVERLAP)
-    pycolmap.match_sequential(
-        database,
-        matching_options=matching,
-        pairing_options=pairing,
-        verification_options=_verification(seed),
-        device=pycolmap.Device.cpu,
-    )
+    pairs = sum(max(0, count - (1 << power)) for power in range(SEQUENTIAL_OVERLAP))
+    with counted_pairs(database, pairs, listener):
+        pycolmap.match_sequential(
+            database,
+            matching_options=matching,
+            pairing_options=pairing,
+            verification_options=_verification(seed),
+            device=pycolmap.Device.cpu,
+        )
 
 
 def match_leftover(
-    database: Path, names: tuple[str, ...], leftover: tuple[str, ...], seed: int, memory: int
+    database: Path,
+    names: tuple[str, ...],
+    leftover: tuple[str, ...],
+    seed: int,
+    memory: int,
+    listener: Pairs,
 ) -> None:
     """Match unregistered photos with all others, or with every n-th so that `MAX_LEFTOVER_PAIRS` is not exceeded."""
     step = max(1, -(-len(leftover) * len(names) // MAX_LEFTOVER_PAIRS))
     pairs = {(min(a, b), max(a, b)) for a in leftover for b in names[::step] if a != b}
-    match_pairs(database, pairs, memory, seed)
+    match_pairs(database, pairs, memory, seed, listener)
 
 
-def match_pairs(database: Path, pairs: Iterable[tuple[str, str]], memory: int, seed: int | None) -> None:
+def match_pairs(
+    database: Path, pairs: Collection[tuple[str, str]], memory: int, seed: int | None, listener: Pairs
+) -> None:
     """Match pairs of photos by name, and verify the matches with a seed; None leaves them unverified."""
     listed = database.with_name("pairs.txt")
     listed.write_text("".join(f"{first} {second}\n" for first, second in sorted(pairs)), encoding="utf-8")
     matching, held = matching_plan(database, memory)
     matching.skip_geometric_verification = seed is None
-    pycolmap.match_image_pairs(
-        database,
-        matching_options=matching,
-        pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed, block_size=held),
-        verification_options=_verification(seed or 0),
-        device=pycolmap.Device.cpu,
-    )
+    with counted_pairs(database, len(pairs), listener):
+        pycolmap.match_image_pairs(
+            database,
+            matching_options=matching,
+            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed, block_size=held),
+            verification_options=_verification(seed or 0),
+            device=pycolmap.Device.cpu,
+        )
 
 
 def _verification(seed: int) -> pycolmap.TwoViewGeometryOptions:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PhotoPoses", "PoseConfig", "find_photos", "photo_folder", "poses_from_photos"]
 
-STAGE = "poses"
+STAGE, MATCHING = "poses", "matching"
 EXHAUSTIVE_LIMIT = 80
 """Up to this many photos every pair is matched; beyond it, photos are assumed to follow one another by name."""
 
@@ -135,7 +135,7 @@ def poses_from_photos(
         seed: Seed for pycolmap.
         memory: Bytes of host memory available. Determines threads and batches, never the result.
         listener: Receives events of stage ``"poses"``: one unit per photo with features, one for matching, one per
-            registered photo.
+            registered photo; and of stage ``"matching"``, one unit per pair of photos.
 
     Raises:
         CaptureError: If there are fewer than three photos, one is unreadable, or none can be registered.
@@ -155,12 +155,15 @@ def poses_from_photos(
     def report(done: int) -> None:
         listener(Event(STAGE, min(done, total - 1), total))
 
+    def report_pairs(done: int, pairs: int) -> None:
+        listener(Event(MATCHING, done, pairs))
+
     with quiet_pycolmap(seed):
         report(0)
         mapping.extract_features(database, photos, config, memory, report)
-        mapping.match_photos(database, len(names), config, seed, memory)
+        mapping.match_photos(database, len(names), config, seed, memory, report_pairs)
         report(len(names) + 1)
-        best = _best_attempt(database, photos, config, seed, memory, report)
+        best = _best_attempt(database, photos, config, seed, memory, report, report_pairs)
         if best is None:
             _discard(work, output)
             raise CaptureError(
@@ -196,6 +199,7 @@ def _best_attempt(
     seed: int,
     memory: int,
     report: Callable[[int], None],
+    report_pairs: Callable[[int, int], None],
 ) -> Attempt | None:
     """The mapper that registers the most photos, with the least error on a tie.
 
@@ -219,7 +223,7 @@ def _best_attempt(
         missing = mapping.unregistered(names, found)
         if missing and not every_pair:
             every_pair = leftover = True
-            mapping.match_leftover(database, names, missing, seed, memory)
+            mapping.match_leftover(database, names, missing, seed, memory, report_pairs)
             check_mapping(database, memory)
             found = _attempt(database, photos, mapper, seed, report, all_pairs=True) or found
         best = max(filter(None, (best, found)), key=lambda attempt: attempt.rank, default=None)

@@ -21,7 +21,7 @@ from PIL import Image
 from lexsplat.captures.capture import Capture, View
 from lexsplat.captures.readers.camera_files import MAX_COORDINATE
 from lexsplat.captures.sfm.feature_budget import check_mapping
-from lexsplat.captures.sfm.photos import PoseConfig
+from lexsplat.captures.sfm.photos import MATCHING, PoseConfig
 from lexsplat.captures.sfm.preparation import PreparedPhotos
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError, FileFormatError
@@ -114,7 +114,8 @@ def triangulate(
         cache_dir: Folder that caches the result by photos, cameras and settings; None disables the cache.
         seed: Seed for pycolmap.
         memory: Bytes of host memory available. Determines threads and batches, never the result.
-        listener: Receives events of stage ``"triangulate"``: one unit per image, then matching and triangulation.
+        listener: Receives events of stage ``"triangulate"``: two units per image, written and with features, then
+            matching and triangulation; and of stage ``"matching"``, one unit per pair of images.
 
     Returns:
         Points ``[P, 3]`` float32, world, and their colors ``[P, 3]`` float32 in 0..1; P may be 0.
@@ -133,13 +134,16 @@ def triangulate(
         return known
     from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
 
-    total = len(views) + 3
+    total = 2 * len(views) + 3
     with tempfile.TemporaryDirectory(prefix="lexsplat-") as temporary, quiet_pycolmap(seed):
 
         def report(done: int) -> None:
             listener(Event(STAGE, done, total))
 
-        points, colors = _run_pycolmap(views, Path(temporary), seed, memory, report)
+        def report_pairs(done: int, pairs: int) -> None:
+            listener(Event(MATCHING, done, pairs))
+
+        points, colors = _run_pycolmap(views, Path(temporary), seed, memory, report, report_pairs)
     listener(Event(STAGE, total, total, {"points": len(points)}))
     if cached is not None:
         _write_cache(cached, points, colors)
@@ -271,7 +275,12 @@ def _write_photo(view: View, folder: Path, name: str) -> None:
 
 
 def _run_pycolmap(
-    views: tuple[View, ...], folder: Path, seed: int, memory: int, report: Callable[[int], None]
+    views: tuple[View, ...],
+    folder: Path,
+    seed: int,
+    memory: int,
+    report: Callable[[int], None],
+    report_pairs: Callable[[int, int], None],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Extract and match features, verify matches with the known poses, triangulate."""
     from lexsplat.captures.sfm import mapping
@@ -286,15 +295,18 @@ def _run_pycolmap(
     largest = max(map(_working_size, views), key=lambda size: size[0] * size[1])
     lenses = tuple((name,) for name in names)
     photos = PreparedPhotos(images, names, lenses, masks if masks.is_dir() else None, largest)
-    mapping.extract_features(database, photos, FEATURES, memory, lambda _: None, camera_model="PINHOLE")
+    mapping.extract_features(
+        database, photos, FEATURES, memory, lambda done: report(len(views) + done), camera_model="PINHOLE"
+    )
     known = _known_reconstruction(database, views)
-    report(len(views) + 1)
+    report(2 * len(views))
     pairs = [(names[first], names[second]) for first, second in matching_pairs(views)]
-    mapping.match_pairs(database, pairs, memory, seed=None)
+    mapping.match_pairs(database, pairs, memory, None, report_pairs)
+    report(2 * len(views) + 1)
     # Drops matches that violate the epipolar geometry of the known poses; estimates nothing.
     pycolmap.guided_geometric_verification(known, database)
     check_mapping(database, memory)
-    report(len(views) + 2)
+    report(2 * len(views) + 2)
     options = pycolmap.IncrementalPipelineOptions(random_seed=seed)
     (folder / "model").mkdir()
     try:

@@ -35,7 +35,7 @@ from lexsplat.language.methods.method import FitRun, TrainingViews, Variant
 from lexsplat.language.segments import make_segments
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import one_thread
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Listener, silent
 
 
 @dataclass(frozen=True)
@@ -109,11 +109,9 @@ class Averaged:
             found, config.codebook, config.averaged, seed=run.seed, memory=run.memory, listener=run.listener
         )
         if config.averaged.segments:
-            run.listener(Event("segments", 0, 1))
             shown = found.totals * found.visible(config.averaged)  # selections ignore Gaussians without mass
             with one_thread():
-                field.segments = make_segments(gaussians, found.rows, shown)
-            run.listener(Event("segments", 1, 1))
+                field.segments = make_segments(gaussians, found.rows, shown, run.listener)
         return field
 
 

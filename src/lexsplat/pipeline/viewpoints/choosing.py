@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -115,7 +116,7 @@ def choose_views(
         side: From where they look: "inside" a room, "around" an object; "auto" finds out.
         subject: The file, for errors and warnings.
         seed: Seed of samples.
-        listener: Receives events of stage "views".
+        listener: Receives events of the stages "views" (candidates) and "comparison" (the good ones and others).
 
     Raises:
         CaptureError: If the Gaussians form no surfaces, or hardly any place shows some.
@@ -268,20 +269,19 @@ def _good_candidates(
     others = others[:: -(-len(others) // _MOST_OTHERS) or 1]
     chosen_from = np.flatnonzero(good)
 
+    compared, total = itertools.count(), len(chosen_from) + len(others)
+
     def weigh(indices: NDArray[np.int64]) -> NDArray[np.float32]:
         weights = np.zeros((len(indices), len(looked_at)), np.float32)
         for row, index in enumerate(indices):
+            listener(Event("comparison", next(compared), total))
             weights[row] = accumulate_weights(gaussians, cameras[index]).cpu().numpy()[looked_at]
         return weights
 
-    return _Tried(
-        len(candidates),
-        [cameras[index] for index in chosen_from],
-        qualities[good],
-        weigh(chosen_from),
-        np.asarray((weigh(others) > _SEEN).any(axis=0)),
-        interior,
-    )
+    weights, elsewhere = weigh(chosen_from), (weigh(others) > _SEEN).any(axis=0)
+    listener(Event("comparison", total, total))
+    good_cameras = [cameras[index] for index in chosen_from]
+    return _Tried(len(candidates), good_cameras, qualities[good], weights, np.asarray(elsewhere), interior)
 
 
 def _on_its_side(

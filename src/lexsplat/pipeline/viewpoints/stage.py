@@ -86,7 +86,7 @@ def _choose(
     chosen = choose_views(
         gaussians, up=up, side=config.views_from, subject=splats, seed=config.seed, listener=listener
     )
-    write_chosen_capture(gaussians, chosen, poses)
+    write_chosen_capture(gaussians, chosen, poses, listener)
     with atomic_path(poses / _FLOATERS) as path, open(path, "wb") as file:
         np.save(file, floaters)
     few = chosen.unseen <= _MANY_UNSEEN * chosen.visible

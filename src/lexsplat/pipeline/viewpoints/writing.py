@@ -15,19 +15,23 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.pipeline.viewpoints.choosing import ChosenViews
 from lexsplat.rendering import render
 from lexsplat.runtime.files import atomic_path, write_json
+from lexsplat.runtime.progress import Event, Listener, silent
 
 CONTACT_SHEET = "contact_sheet.jpg"
 _THUMBNAIL = (240, 180)
 
 
 @torch.no_grad()
-def write_chosen_capture(gaussians: Gaussians, chosen: ChosenViews, folder: Path) -> None:
+def write_chosen_capture(
+    gaussians: Gaussians, chosen: ChosenViews, folder: Path, listener: Listener = silent
+) -> None:
     """Render the views into ``images/``, and write ``transforms.json`` last, which makes the folder a capture.
 
     Args:
         gaussians: The scene.
         chosen: Its views.
         folder: Folder to make; what an earlier choice left there is removed.
+        listener: Receives events of stage "pictures".
     """
     images = folder / "images"
     images.mkdir(parents=True, exist_ok=True)
@@ -39,6 +43,7 @@ def write_chosen_capture(gaussians: Gaussians, chosen: ChosenViews, folder: Path
     sheet = Image.new("RGB", (columns * _THUMBNAIL[0], rows * _THUMBNAIL[1]))
     frames = []
     for number, camera in enumerate(chosen.cameras):
+        listener(Event("pictures", number, len(chosen.cameras)))
         rendered = render(gaussians, camera).image.clamp(0, 1).cpu().numpy()
         picture = Image.fromarray(_bytes(rendered))
         name = f"images/view_{number:03}.jpg"
@@ -54,6 +59,7 @@ def write_chosen_capture(gaussians: Gaussians, chosen: ChosenViews, folder: Path
     with atomic_path(folder / CONTACT_SHEET) as path:
         sheet.save(path, format="JPEG", quality=85)
     write_json(folder / "transforms.json", {"camera_model": "PINHOLE", "frames": frames})
+    listener(Event("pictures", len(chosen.cameras), len(chosen.cameras)))
 
 
 def _bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -19,6 +19,7 @@ from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import FileFormatError, LexsplatError, LibraryError
 from lexsplat.runtime.files import locked
+from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.library.contents import Contents, map_contents
 from lexsplat.scenes.library.entries import Codes, OwnTexts, map_codes, record_of, write_entry
@@ -73,8 +74,8 @@ class Library:
         self.root, self._device = Path(root), device
         name = library_name(self.root)
         self.server = Server(index, name, self.root) if index else None
-        self._home = self.root.resolve()
-        self._texts = TextCache(self.root / "texts")
+        self._home, self._texts = self.root.resolve(), TextCache(self.root / "texts")
+        self.listener: Listener = silent  # receives progress events of reading, adding and verifying scenes
         self._towers: dict[str, TextTower] = {}
         self._records: dict[str, tuple[tuple[int, int], Record]] = {}
         self._codes: dict[str, tuple[str, Codes]] = {}
@@ -309,18 +310,17 @@ class Library:
     def enter(self, path: str | Path, name: str | None = None) -> Record:
         """`add` under a name, while the library is locked (`changing`)."""
         scene = open_scene(path, device=self._device)
-        folder = scene.folder
+        scene.listener, folder = self.listener, scene.folder
         if folder is None:
             raise ValueError("a scene that was opened has a folder")
         place = BUNDLED if folder.is_bundled else str(folder.root.resolve())
         name = name or self._name_for(place, state_of(folder))
         before = self.record(name)
         scene.embed(COMPARED)  # in one call, so that the cache of the scene is written once
-        known = scene.encoder_identity().get("encoder_hash")
         codes, contents = Codes.of(scene), Contents.of(scene)
         record = record_of(self.root, name, place, scene, codes, contents)
         write_entry(self.root, record, codes, contents)
-        if known:  # what the scene has in its cache, all of its scenes have
+        if known := scene.encoder_identity().get("encoder_hash"):  # all of its scenes get these texts
             self._texts.encode(known, COMPARED, lambda: OwnTexts(scene, known))
         for file in before.files - record.files if before is not None else ():
             (self.stage / file).unlink(missing_ok=True)

@@ -6,6 +6,7 @@ import contextlib
 from typing import TYPE_CHECKING
 
 from lexsplat.runtime.errors import LexsplatError, LibraryError
+from lexsplat.runtime.progress import Event
 from lexsplat.scenes.library.contents import map_contents
 from lexsplat.scenes.library.records import (
     Record,
@@ -64,8 +65,13 @@ def orphans(library: Library) -> dict[str, str]:
 
 
 def _entries(library: Library) -> dict[str, str]:
-    problems = ((name, _problem(library, name)) for name in library.names())
-    return {name: problem for name, problem in problems if problem}
+    found, names = {}, library.names()
+    for done, name in enumerate(names):
+        library.listener(Event("verify", done, len(names)))
+        if problem := _problem(library, name):
+            found[name] = problem
+    library.listener(Event("verify", len(names), len(names)))
+    return found
 
 
 def _problem(library: Library, name: str) -> str:

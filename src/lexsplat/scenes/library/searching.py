@@ -16,6 +16,7 @@ from lexsplat.queries.selection import PRESENCES
 from lexsplat.queries.spelling import spellings
 from lexsplat.queries.vocabulary import default_vocabulary
 from lexsplat.runtime.errors import FileFormatError, LexsplatError, QueryError
+from lexsplat.runtime.progress import Event
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.library.bounds import CERTAIN, SURELY_NOT, phrase_bound, presence_bounds
@@ -215,7 +216,11 @@ def _bounds(library: Library, records: list[Record], phrase: Phrase) -> list[flo
     A scene corrects typing errors where that helps (`Scene.understand`), so both spellings are compared.
     """
     spellings = spellings_of(phrase, records[0].clip)
-    codes = [library.codes(record) for record in records]
+    codes = []
+    for done, record in enumerate(records):
+        library.listener(Event("scenes", done, len(records)))
+        codes.append(library.codes(record))
+    library.listener(Event("scenes", len(records), len(records)))
     sound = [each for each in codes if each is not None]
     if not spellings or not sound:
         return [-1.0 if each is None else CERTAIN for each in codes]

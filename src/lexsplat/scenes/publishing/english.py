@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 HASHES = 5
 """Bits of each word. With eight bits of the filter for a word, 2 % of other texts count as words."""
 
 
+@cache
 def english_file() -> bytes:
     """A Bloom filter of the English words of `lexsplat.queries.spelling.is_word`.
 

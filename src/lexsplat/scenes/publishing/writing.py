@@ -15,6 +15,7 @@ from lexsplat.queries.kinds import words_of_things
 from lexsplat.queries.scoring import form_used
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import read_json, write_json
+from lexsplat.runtime.progress import Event
 from lexsplat.scenes.formats.language import stored_language
 from lexsplat.scenes.publishing.english import english_file
 from lexsplat.scenes.publishing.index import PAGE_FILES, folder_index, page_file, single_index
@@ -49,6 +50,8 @@ MOST_SPLATS = 4_000_000
 """Gaussians that a browser draws, at most."""
 SINGLE_FILE_BYTES = 50_000_000
 """Largest size of the files that go into one HTML file."""
+_STAGE, _STEPS = "page", 6
+"""What progress events are of: Gaussians, their codes, objects, phrases, text tower, manifest."""
 _PLAIN_NAME = re.compile(r"\w+(\.\w+)*")
 
 
@@ -199,25 +202,31 @@ def _own_files(folder: Path) -> set[str]:
 def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[str, Any]:
     """Write everything but ``index.html`` and return the manifest, which is written as well."""
     start = _start_view(scene, options.start_view)
+    scene.listener(Event(_STAGE, 0, _STEPS))
     kept = most_visible(scene.gaussians, options.max_splats or len(scene.gaussians))
     gaussians = scene.gaussians.select(kept.to(scene.gaussians.device)).to("cpu")
     splats, rotation = write_splats(gaussians, folder, shrink=True)
+    scene.listener(Event(_STAGE, 1, _STEPS))
     identity = scene.encoder_identity()
     language = stored_language(scene.field, identity).select(kept)
     (folder / "codes.bin").write_bytes(splat_codes(language))
     segments = scene.field.segments if form_used(scene.field, scene.query) == "segment" else None
     if segments is not None:
         (folder / "segments.bin").write_bytes(segments_file(segments.select(kept), scene.hidden.cpu()[kept]))
+    scene.listener(Event(_STAGE, 2, _STEPS))
     objects = listed_objects(scene)
     (folder / "objects.bin").write_bytes(objects_file(objects, kept))
+    scene.listener(Event(_STAGE, 3, _STEPS))
     phrases = page_phrases(asked_phrases(scene), bundled=scene.clip == "bundled")
     tables, presences = phrase_answers(scene, list(phrases))
     (folder / "words.txt").write_bytes(words_file(phrases, presences))
     (folder / "words.bin").write_bytes(tables.numpy().tobytes())
     (folder / "english.bin").write_bytes(english_file())
+    scene.listener(Event(_STAGE, 4, _STEPS))
     text = None
     if not options.words_only:
         text = write_text_tower(scene, folder / "text.safetensors", folder / "tokenizer.json")
+    scene.listener(Event(_STAGE, 5, _STEPS))
     for name in PAGE_FILES:
         (folder / name).write_bytes(page_file(name))
     manifest = scene_manifest(scene, gaussians, splats.name, rotation, options.title, DRAWN_SPLATS)
@@ -256,6 +265,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     manifest["files"] = {path.name: checksums(path.read_bytes()) for path in sorted(folder.iterdir())}
     manifest["files"]["index.html"] = {}  # it belongs to the page; nothing reads it by its checksum
     write_json(folder / "manifest.json", manifest)
+    scene.listener(Event(_STAGE, _STEPS, _STEPS))
     return manifest
 
 
