@@ -33,7 +33,7 @@ from lexsplat.features.segments2d import (
 )
 from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.pipeline.provenance import features_identity
+from lexsplat.pipeline.provenance import settings_identity
 from lexsplat.runtime.errors import LexsplatError, ModelError
 from lexsplat.runtime.fingerprints import fingerprint
 
@@ -256,9 +256,9 @@ def test_without_segments_stages_have_the_fingerprints_of_before(tiny_capture):
         (FeatureConfig.bundled(), "a85202a76450d64c49bc38cf"),
         (FeatureConfig(), "2badea7242143a5e9615e379"),
     ):
-        stage = ["photos", *features_identity(config, capture), [["bundled"], ["none"]]]
+        stage = ["photos", *settings_identity(config, capture), [["bundled"], ["none"]]]
         assert fingerprint(stage) == before
-        with_segments = features_identity(replace(config, segments="slic"), capture)
+        with_segments = settings_identity(replace(config, segments="slic"), capture)
         assert fingerprint(["photos", *with_segments, [["bundled"], ["none"]]]) != before
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 SOURCES = ("none", "slic", "sam2")
 """Words for where segments come from, beside folders and models."""
 
-SUPERPIXELS = (800, 200)
+SUPERPIXELS = (3000, 1000)
 """Superpixels of a photo in each level of "slic"."""
 
 _COMPACTNESS = 10.0  # of superpixels: weight of distance beside that of color

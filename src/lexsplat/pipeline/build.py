@@ -18,8 +18,7 @@ from torch import Tensor
 from lexsplat.captures import Capture, View, load_annotations
 from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook
-from lexsplat.features import FeatureMaps, check_external_features, external_identity
-from lexsplat.features.segments2d import check_segments
+from lexsplat.features import FeatureMaps
 from lexsplat.geometry.world import World, parse_vector
 from lexsplat.language.code_maps import MaskedCodeMaps, mark_masked_cells
 from lexsplat.language.methods import METHODS, FitRun, TrainingViews
@@ -27,14 +26,14 @@ from lexsplat.language.methods.joint import JointTrainer
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.distribution import extract_on_workers
 from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps, fetch_clip
-from lexsplat.pipeline.inputs import PhotoSurvey, prepare_capture, refuse_without_cameras, survey_photos
-from lexsplat.pipeline.provenance import (
-    features_identity,
-    model_identity,
-    model_place,
-    with_full_paths,
-    write_provenance,
+from lexsplat.pipeline.inputs import (
+    PhotoSurvey,
+    check_given_maps,
+    prepare_capture,
+    refuse_without_cameras,
+    survey_photos,
 )
+from lexsplat.pipeline.provenance import features_identity, model_place, with_full_paths, write_provenance
 from lexsplat.pipeline.splats import check_agreement, existing_splats, splats_hash
 from lexsplat.pipeline.viewpoints import capture_of_splats, splats_of_capture
 from lexsplat.pipeline.viewpoints.choosing import SIZE
@@ -125,9 +124,7 @@ def build(
             config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
             capture = capture.downscaled(config.downscale or 1.0)
             _check_photos(capture, parse_bytes(config.memory))
-            if config.features_from is not None:
-                check_external_features(config.features_from, capture)
-            check_segments(config.features, capture)
+            check_given_maps(config, capture)
             builder = _Builder(capture, folder, config, device, listener, splats)
             builder.encoders, builder.workers = checked, workers
             SharedFolder.forget_marks(folder.root / "checkpoints")
@@ -215,7 +212,7 @@ class _Builder:
         """The stages of the method, in the order in which they run."""
         config, folder = self.config.result_settings(), self.folder
         method_settings = [config.method, *(getattr(config, part) for part in self.method.settings)]
-        features = self._feature_inputs(capture_hash, config)
+        features = [capture_hash, *features_identity(config, self.capture)]
         own_features = [] if config.features_from is not None else [folder.features_path]
         language = ["reconstruct", self.method.needs[-1], method_settings, config.seed]
         stages = {
@@ -245,13 +242,6 @@ class _Builder:
         if self.blocks > 1:
             inputs += [f"{self.blocks} blocks", self.config.up]
         return _Stage(inputs, self._reconstruct, outputs)
-
-    def _feature_inputs(self, capture_hash: str, config: BuildConfig) -> list[Any]:
-        clip = model_identity(config.clip, "clip")
-        if config.features_from is not None:
-            return [capture_hash, external_identity(config.features_from, self.capture), clip]
-        dino = model_identity(config.dino if config.uses_dino else "none", "dino")
-        return [capture_hash, *features_identity(config.features, self.capture), [clip, dino]]
 
     def _fingerprint(self, stage: _Stage) -> str:
         return fingerprint([

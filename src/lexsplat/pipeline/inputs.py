@@ -165,10 +165,19 @@ def survey_photos(
     if capture is None:
         return PhotoSurvey(config.frames, _VIDEO_SIZE)
     load_annotations(capture)
+    check_given_maps(config, capture)
+    return PhotoSurvey(len(capture.train_names), _largest(capture))
+
+
+def check_given_maps(config: BuildConfig, capture: Capture) -> None:
+    """Refuse features of another program and 2D segments that do not fit the photos.
+
+    Raises:
+        LexsplatError: As `check_external_features` and `check_segments`.
+    """
     if config.features_from is not None:
         check_external_features(config.features_from, capture)
     check_segments(config.features, capture)
-    return PhotoSurvey(len(capture.train_names), _largest(capture))
 
 
 def count_photos(source: Path, config: BuildConfig) -> PhotoSurvey:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lexsplat.captures import Capture
-from lexsplat.features import FeatureConfig
+from lexsplat.features import FeatureConfig, external_identity
 from lexsplat.features.hub import content_hash, model_folder
 from lexsplat.features.segments2d import SOURCES, sam2_name, segments_identity
 from lexsplat.geometry.boxes import Up
@@ -104,7 +104,16 @@ def _with_full_paths(features: FeatureConfig) -> FeatureConfig:
     return features if segments in SOURCES else replace(features, segments=model_place(segments))
 
 
-def features_identity(features: FeatureConfig, capture: Capture) -> list[Any]:
+def features_identity(config: BuildConfig, capture: Capture) -> list[Any]:
+    """What identifies the features of a build: settings and models, or the files of another program."""
+    clip = model_identity(config.clip, "clip")
+    if config.features_from is not None:
+        return [external_identity(config.features_from, capture), clip]
+    dino = model_identity(config.dino if config.uses_dino else "none", "dino")
+    return [*settings_identity(config.features, capture), [clip, dino]]
+
+
+def settings_identity(features: FeatureConfig, capture: Capture) -> list[Any]:
     """What identifies settings of features: without segments the same as before there were any."""
     settings = to_json(features)
     name = settings.pop("segments")
