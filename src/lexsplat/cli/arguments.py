@@ -244,6 +244,20 @@ def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
 
 
 @REGISTRY.primitive_rule
+def _text(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """``TEXT`` in place of ``STR`` where an option has no placeholder of its own."""
+    if info.type is not str:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="TEXT",
+        instance_from_str=lambda words: words[0],
+        is_instance=lambda value: isinstance(value, str),
+        str_from_instance=lambda value: [value],
+    )
+
+
+@REGISTRY.primitive_rule
 def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     """``FLOAT`` in place of ``{None}|FLOAT``; the word None stays accepted."""
     options = get_args(info.type)
@@ -268,7 +282,7 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
 
 @REGISTRY.primitive_rule
 def _several(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """``STR ...`` in place of ``[STR [STR ...]]``, "none" in place of nothing."""
+    """``TEXT ...`` in place of ``[TEXT [TEXT ...]]``, "none" in place of nothing."""
     arguments = get_args(info.type)
     if get_origin(info.type) is not tuple or len(arguments) != 2 or arguments[1] is not Ellipsis:
         return None
