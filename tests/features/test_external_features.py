@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 from support.noise_photos import HEIGHT, WIDTH, make_capture
-from support.refusals import assert_reports
+from support.refusals import assert_reports, build_refused
 from support.tiny_capture import SPHERES, camera_poses, trace
 
 from lexsplat import cli
@@ -21,7 +21,6 @@ from lexsplat.captures import Capture, load_capture
 from lexsplat.codebook import Codebook
 from lexsplat.features import FeatureMap, external_identity, load_external_features
 from lexsplat.features.encoders import load_clip
-from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import FileFormatError, MemoryBudgetError
 
@@ -218,11 +217,9 @@ def test_segments_of_another_size_are_reported_before_structure_from_motion_and_
     folder = shutil.copytree(segments, tmp_path / "segments")
     change(folder / "view_03_f.npy")
     config = BuildConfig(clip="bundled", dino="none", device="cpu", iterations=2, features_from=folder)
-    for source in (tiny_capture, tiny_capture / "images"):
-        with pytest.raises(FileFormatError) as caught:
-            build(source, tmp_path / "scene", config)
-        assert_reports(caught.value, *told)
-        assert not (tmp_path / "scene").exists(), "nothing half-written"
+    build_refused(
+        (tiny_capture, tiny_capture / "images"), tmp_path / "scene", config, *told, kind=FileFormatError
+    )
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from PIL import Image
-from support.refusals import assert_reports
+from support.refusals import assert_reports, build_refused
 from support.tiny_capture import QUICK_BUILD, camera_poses, trace
 
 from lexsplat import cli
@@ -209,11 +209,9 @@ def test_wrong_segments_are_reported_before_structure_from_motion_and_reconstruc
     change(folder / "view_03.png")
     features = FeatureConfig(segments=str(folder))
     config = BuildConfig(clip="bundled", dino="none", device="cpu", iterations=2, features=features)
-    for source in (tiny_capture, tiny_capture / "images"):
-        with pytest.raises(LexsplatError) as caught:
-            build(source, tmp_path / "scene", config)
-        assert_reports(caught.value, *told)
-        assert not (tmp_path / "scene").exists(), "nothing half-written"
+    build_refused(
+        (tiny_capture, tiny_capture / "images"), tmp_path / "scene", config, *told, kind=LexsplatError
+    )
 
 
 def test_a_misspelt_word_gets_a_suggestion_and_a_model_is_loaded_before_structure_from_motion(

@@ -178,7 +178,7 @@ def test_bad_arguments_are_refused() -> None:
 
 @pytest.mark.parametrize("count", [7, 8, 21])
 def test_a_mean_in_blocks_has_the_value_and_the_gradients_of_the_whole(monkeypatch, count):
-    monkeypatch.setitem(losses._BLOCK, "cpu", 8)
+    monkeypatch.setattr(losses, "CPU_BLOCK", 8)
     rng = torch.Generator().manual_seed(0)
     decoder = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.ReLU(), torch.nn.Linear(4, 5)).double()
     given = torch.randn(count, 3, generator=rng, dtype=torch.float64)

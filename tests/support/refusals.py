@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from lexsplat.captures import load_capture
 from lexsplat.runtime.errors import CaptureError, FileFormatError, LexsplatError
 from lexsplat.scenes.formats.reading import read_splats
+
+if TYPE_CHECKING:
+    from lexsplat.pipeline.config import BuildConfig
 
 
 def assert_reports(error: LexsplatError, *parts: str) -> None:
@@ -28,6 +33,19 @@ def fails(path, *parts, kind=CaptureError, **options):
     with pytest.raises(kind) as caught:
         load_capture(path, **options)
     assert_reports(caught.value, *parts)
+
+
+def build_refused(
+    sources: Iterable[Path], output: Path, config: BuildConfig, *parts: str, kind: type[LexsplatError]
+) -> None:
+    """Assert that a build of each source is refused in one line, and leaves no folder."""
+    from lexsplat.pipeline.build import build
+
+    for source in sources:
+        with pytest.raises(kind) as caught:
+            build(source, output, config)
+        assert_reports(caught.value, *parts)
+        assert not output.exists(), "nothing half-written"
 
 
 def refused(path: Path, content: bytes, *parts: str) -> str:

@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 
 from lexsplat.captures.images.bands import FilledRows, MaskRows, Rows, resized
 from lexsplat.captures.images.reading import PhotoRows, image_size, read_mask, resize_nearest, sizes_agree
-from lexsplat.captures.images.undistortion import (
-    Lens,
-    RemappedRows,
-    nearest_pixels,
-    undistort,
-    undistort_nearest,
-)
+from lexsplat.captures.images.undistortion import Lens, RemappedRows, undistort, undistort_nearest
 from lexsplat.geometry.cameras import Camera, camera_extent
 from lexsplat.runtime.errors import CaptureError
 
@@ -109,10 +103,8 @@ class View:
         """
         return self.undistort_mask(read_mask(path), path, size)
 
-    def undistort_mask(
-        self, mask: NDArray[np.bool_], subject: Path, size: tuple[int, int] | None = None
-    ) -> NDArray[np.bool_]:
-        """A mask ``[h, w]`` as `load_mask` undistorts one; ``subject`` is the file named in errors."""
+    def undistort_mask(self, mask: NDArray, subject: Path, size: tuple[int, int] | None = None) -> NDArray:
+        """A mask, or a map of numbers, ``[h, w]`` as `load_mask` undistorts one; errors name the file ``subject``."""
         height, width = mask.shape
         self._check_aspect(subject, (width, height))
         if self._is_undistorted(mask) or not self.lens.distorts:
@@ -124,19 +116,6 @@ class View:
                 max(1, round(full[1] * height / self.lens.height)),
             )
         return undistort_nearest(mask, self.lens, self._checked_size(size))
-
-    def undistort_labels(
-        self, labels: NDArray[np.integer], subject: Path, size: tuple[int, int]
-    ) -> NDArray[np.integer]:
-        """A map of numbers ``[h, w]`` drawn on the photo, at a width and height, as `load_mask` undistorts a mask.
-
-        Raises:
-            CaptureError: If its aspect is not the photo's.
-        """
-        self._check_aspect(subject, (labels.shape[1], labels.shape[0]))
-        if self._is_undistorted(labels) or not self.lens.distorts:
-            return resize_nearest(labels, self._checked_size(size))
-        return labels[nearest_pixels(self.lens, self._checked_size(size), labels.shape)]
 
     def load_valid(self, size: tuple[int, int] | None = None) -> NDArray[np.bool_] | None:
         """Pixels that losses use, ``[H, W]`` bool at the camera's size, or None for all.

@@ -74,9 +74,8 @@ class Mcp:
             return
         from lexsplat.runtime.listening import listen
 
-        with listen(
-            self.host, self.port
-        ) as listening:  # first: a taken port is refused before anything is loaded
+        # First: a taken port is refused before anything is loaded.
+        with listen(self.host, self.port) as listening:
             self._serve(listening)
 
     def _serve(self, listening: socket.socket | None) -> None:

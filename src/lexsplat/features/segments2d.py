@@ -182,7 +182,7 @@ class SegmentFolder:
                     remedy="write it again (docs/captures.md has the layout)",
                 )
             levels = levels.reshape(-1, *levels.shape[-2:])
-        sampled = np.stack([view.undistort_labels(level, path, size) for level in levels])
+        sampled = np.stack([view.undistort_mask(level, path, size) for level in levels])
         return segment_numbers(sampled, path).astype(np.int32)
 
 
@@ -228,7 +228,7 @@ def segments_identity(name: str, capture: Capture) -> list[str]:
     return ["folder", *(f"{view.stem} {file_hash(folder.path(view), 16)}" for view in capture.train_views)]
 
 
-# Beside the maps: where the segments come from and are kept, and who is told.
+# Parameters beside the maps: the source of the segments, their cache, and the listener.
 def pooled_features(
     maps: FeatureMaps,
     capture: Capture,

@@ -207,9 +207,8 @@ def build_model(folder: Path, name: str, spare: str) -> Any:
     state = load_weights(folder, name)
     try:
         config = AutoConfig.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
-        if (
-            config.model_type == "sam2_video"
-        ):  # SAM 2 as it is published; its part for photos is a model of its own
+        # SAM 2 as it is published; its part for photos is a model of its own.
+        if config.model_type == "sam2_video":
             from transformers import Sam2Config
 
             parts = ("vision_config", "prompt_encoder_config", "mask_decoder_config")

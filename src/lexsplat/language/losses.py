@@ -18,9 +18,8 @@ SmoothingWeight = Literal["max", "linear"]
 LOG_MARGIN = 1e-4
 """U is clamped to 1 minus this: -log(1 - U) is infinite at U = 1, which float32 rendering can reach."""
 
-_BLOCK = {"cpu": 4096}
-"""Rows of a block in `mean_in_blocks` by kind of device: on a CPU, activations of so many stay in its cache."""
-_LARGE_BLOCK = 1 << 18
+CPU_BLOCK, GPU_BLOCK = 1 << 12, 1 << 18
+"""Rows of a block in `mean_in_blocks`; the activations of a CPU's block stay in its cache."""
 
 
 def mean_in_blocks(
@@ -37,7 +36,7 @@ def mean_in_blocks(
         parameters: Tensors that the loss reads beside its arguments, for their gradients.
     """
     count = len(rows[0])
-    block = _BLOCK.get(rows[0].device.type, _LARGE_BLOCK)
+    block = CPU_BLOCK if rows[0].device.type == "cpu" else GPU_BLOCK
     if count <= block:
         return loss(*rows)
     return _BlockedMean.apply(loss, block, len(rows), *rows, *parameters)

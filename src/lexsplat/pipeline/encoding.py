@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("lexsplat")
 
 _TOLD_FROM = 12
-"""Photos from which the time is told that no check has told; measuring it takes as long as about one."""
+"""Fewest photos for which the time is estimated here: the estimate takes about as long as one photo."""
 
 
 BUNDLED_SCENES = Path(__file__).resolve().parents[1] / "demo"

@@ -149,28 +149,17 @@ def undistort(source: Rows, lens: Lens, size: tuple[int, int]) -> NDArray[np.flo
     return resized(RemappedRows(source, lens, between), size)
 
 
-def undistort_nearest(mask: NDArray[np.bool_], lens: Lens, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """A mask ``[h, w]`` drawn on a photo, at ``size`` (width, height) on its pinhole image, by nearest pixel."""
-    grid = _sampling_grid(lens, size)
-    return _remap(mask[..., None].astype(np.float32), grid, "nearest")[..., 0] > 0.5
+def undistort_nearest(values: NDArray, lens: Lens, size: tuple[int, int]) -> NDArray:
+    """A mask or other map ``[h, w]`` drawn on a photo, at ``size`` (width, height) on its pinhole image.
 
-
-def nearest_pixels(
-    lens: Lens, size: tuple[int, int], shape: tuple[int, int]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns ``[h, w]`` of a map of ``shape`` drawn on a photo, at the pixels of its pinhole image.
-
-    Args:
-        lens: The lens.
-        size: Width and height of the pinhole image in pixels.
-        shape: Height and width of the map.
+    The nearest pixel is taken, rounded as by torch's ``grid_sample``.
     """
     grid = _sampling_grid(lens, size)
     rows, columns = (
-        np.clip(((grid[..., axis] + 1.0) * (length / 2)).astype(np.intp), 0, length - 1)
-        for axis, length in ((1, shape[0]), (0, shape[1]))
+        np.rint(((grid[..., axis] + 1) * length - 1) / 2).clip(0, length - 1).astype(np.intp)
+        for axis, length in ((1, values.shape[0]), (0, values.shape[1]))
     )
-    return rows, columns
+    return np.asarray(values[rows, columns])
 
 
 class RemappedRows:
@@ -220,14 +209,12 @@ def _grid_rows(lens: Lens, size: tuple[int, int], first: int, last: int) -> NDAr
     return grid
 
 
-def _remap(
-    image: NDArray[np.float32], grid: NDArray[np.float32], mode: str = "bicubic"
-) -> NDArray[np.float32]:
+def _remap(image: NDArray[np.float32], grid: NDArray[np.float32]) -> NDArray[np.float32]:
     import torch
 
     source = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
     # Without align_corners, -1 and 1 are the outer edges, which matches pixel centers at +0.5.
     sampled = torch.nn.functional.grid_sample(
-        source, torch.from_numpy(grid)[None], mode=mode, padding_mode="border", align_corners=False
+        source, torch.from_numpy(grid)[None], mode="bicubic", padding_mode="border", align_corners=False
     )
     return sampled[0].permute(1, 2, 0).clamp(0.0, 1.0).contiguous().numpy()
