@@ -33,7 +33,11 @@ class Training:
         script = REPOSITORY / "benchmarks" / "training_slices.py"
         self.process = subprocess.Popen(
             [sys.executable, str(script), *arguments, "--settings", json.dumps(dict(settings))],
-            env={**os.environ, "PYTHONPATH": str(source)},
+            env={
+                **os.environ,
+                "PYTHONPATH": str(source),
+                "OMP_WAIT_POLICY": "PASSIVE",
+            },  # as lexsplat sets it
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

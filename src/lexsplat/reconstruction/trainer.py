@@ -106,6 +106,7 @@ class Reconstructor:
         self._density = DensityControl(config, self._extent, seed=seed, device=self.device)
         self._images: TrainingImages | None = None
         self._images_shrink = 0.0
+        self._background_errors: dict[str, float] = {}
         self.last_view = ""
         """Name of the view of the last step."""
         self.tracks_origins = False
@@ -188,7 +189,7 @@ class Reconstructor:
                 found=f"{value} at iteration {self.steps_done + 1}",
                 remedy="check the cameras, or lower the learning rates",
             )
-        self._update_errors(image, target.image)
+        self._update_errors(name, image, target.image)
         self._optimize()
         self._control_density(rendering.means2d, rendering.radii, (camera.width, camera.height))
         self.last_view = name
@@ -337,6 +338,7 @@ class Reconstructor:
                 folder=self._photo_folder,
             )
             self._images_shrink = shrink
+            self._background_errors.clear()
         return self._images
 
     def _regularization(self) -> Tensor | float:
@@ -352,7 +354,7 @@ class Reconstructor:
         """Whether step ``done`` reads its loss: always on a CPU, every few steps on CUDA, where reading waits."""
         return self.device.type == "cpu" or done % EVENT_EVERY == 0 or done == self.config.iterations
 
-    def _update_errors(self, image: Tensor, target: Tensor) -> None:
+    def _update_errors(self, name: str, image: Tensor, target: Tensor) -> None:
         """Update the running mean squared errors of the renderings and of the bare background.
 
         Raises:
@@ -360,11 +362,12 @@ class Reconstructor:
         """
         if not self.reads_loss(self.steps_done + 1):
             return
-        errors = torch.mean((image.detach() - target) ** 2), torch.mean((self._background - target) ** 2)
+        if name not in self._background_errors:
+            self._background_errors[name] = _mean_square(self._background - target)
+        errors = _mean_square(image.detach() - target), self._background_errors[name]
         olds = self._recent_error, self._background_error
         self._recent_error, self._background_error = (
-            float(error) if math.isnan(old) else 0.95 * old + 0.05 * float(error)
-            for old, error in zip(olds, errors)
+            error if math.isnan(old) else 0.95 * old + 0.05 * error for old, error in zip(olds, errors)
         )
         if self._recent_error > 4 * self._background_error + 0.5:
             raise TrainingError(
@@ -384,6 +387,11 @@ class Reconstructor:
             optimizer.zero_grad(set_to_none=True)
         if self._exposures is not None:
             self._exposures.optimize()
+
+
+def _mean_square(difference: Tensor) -> float:
+    values = difference.flatten()
+    return float(values.dot(values)) / len(values)
 
 
 def initial_gaussians(
