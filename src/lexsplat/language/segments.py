@@ -37,6 +37,9 @@ _MOST = 20_000
 _COARSEST = 20
 """No level has fewer segments, unless the lowest has."""
 _LINKS_AT_ONCE = 1 << 16
+"""Links between two reports."""
+_LINKS_IN_CACHE = 1 << 10
+"""Links whose features are read at once, so that they stay in the processor's cache."""
 STAGE = "segments"
 _MERGE_UNITS = 10
 """Units of progress of the merging of segments."""
@@ -175,9 +178,12 @@ def _links(means: FloatArray, neighbors: int) -> tuple[IntArray, IntArray]:
 
 def _language_distances(features: Rows, first: IntArray, second: IntArray) -> FloatArray:
     """One minus the cosine of the features of linked Gaussians ``[E]``."""
-    rows = [features(torch.from_numpy(index)).cpu().double().numpy() for index in (first, second)]
-    lengths = [np.sqrt(np.einsum("ij,ij->i", one, one)) for one in rows]
-    cosines = np.einsum("ij,ij->i", *rows) / np.maximum(lengths[0] * lengths[1], 1e-12)
+    cosines = np.empty(len(first))
+    for start in range(0, len(first), _LINKS_IN_CACHE):
+        part = slice(start, start + _LINKS_IN_CACHE)
+        rows = [features(torch.from_numpy(index[part])).cpu().double().numpy() for index in (first, second)]
+        lengths = [np.sqrt(np.einsum("ij,ij->i", one, one)) for one in rows]
+        cosines[part] = np.einsum("ij,ij->i", *rows) / np.maximum(lengths[0] * lengths[1], 1e-12)
     return np.maximum(1 - cosines, 0.0)
 
 

@@ -64,8 +64,9 @@ class MeanFeatures:
 
     def halves(self, index: slice | Tensor) -> list[Tensor]:
         """The same, followed by the DINO means ``[n, Dd]`` if there are any."""
-        chosen = index if isinstance(index, slice) else index.cpu().numpy()
-        rows = torch.from_numpy(np.asarray(self.means[chosen], np.float32)).to(self.totals.device)
+        means = torch.from_numpy(self.means)
+        chosen = means[index] if isinstance(index, slice) else means.index_select(0, index.cpu())
+        rows = chosen.float().to(self.totals.device)
         clip = rows.shape[1] - self.dino
         return [rows[:, :clip], rows[:, clip:]] if self.dino else [rows]
 
