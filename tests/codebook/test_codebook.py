@@ -231,17 +231,23 @@ def test_kmeans_never_raises_the_cosine_loss() -> None:
 
 @pytest.mark.parametrize("noise", [1.0, 0.1])
 def test_kmeans_seeds_are_those_of_a_comparison_with_every_feature(noise):
-    """The same draws with squared distances in float64; clustered features are compared with few seeds."""
+    """Greedy k-means++ of the same draws in float64; clustered features are compared with few seeds."""
     rng = np.random.default_rng(0)
     features = rng.normal(size=(40, 16))[rng.integers(0, 40, 3000)] + noise * rng.normal(size=(3000, 16))
     features /= np.linalg.norm(features, axis=1, keepdims=True)
     found = _kmeans_seeds(torch.from_numpy(features).float(), 64, torch.Generator().manual_seed(5)).tolist()
     generator = torch.Generator().manual_seed(5)
-    expected, nearest = [int(torch.randint(3000, (1,), generator=generator))], np.inf
+    expected = [int(torch.randint(3000, (1,), generator=generator))]
+    nearest = ((features - features[expected[0]]) ** 2).sum(1)
     while len(expected) < 64:
-        nearest = np.minimum(nearest, ((features - features[expected[-1]]) ** 2).sum(1))
-        draw = float(torch.rand(1, generator=generator, dtype=torch.float64)) * nearest.sum()
-        expected.append(int(np.searchsorted(np.cumsum(nearest), draw, side="right")))
+        draws = (
+            torch.rand(2 + int(np.log(64)), generator=generator, dtype=torch.float64).numpy() * nearest.sum()
+        )
+        drawn = np.searchsorted(np.cumsum(nearest), draws, side="right")
+        lowered = [np.minimum(nearest, ((features - features[place]) ** 2).sum(1)) for place in drawn]
+        best = int(np.argmin([values.sum() for values in lowered]))
+        expected.append(int(drawn[best]))
+        nearest = lowered[best]
     assert found == expected
 
 

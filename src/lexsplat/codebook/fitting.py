@@ -5,6 +5,7 @@ The fit runs on one thread, so the same seed gives bit-identical codes on any nu
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -194,7 +195,7 @@ def spherical_kmeans(
     generator: torch.Generator,
     listener: Listener = silent,
 ) -> tuple[Tensor, Tensor | None]:
-    """k-means for the similarity of Eq. 4, with k-means++ seeds.
+    """k-means for the similarity of Eq. 4, from `_kmeans_seeds`.
 
     The sum of a cluster's unit vectors, normalized half by half, minimizes Eq. 5 for a given assignment, so every
     iteration lowers L_cos. An empty cluster restarts at the feature with the lowest similarity to its code.
@@ -233,36 +234,41 @@ def _uniform_codes(features: Tensor, num_codes: int, generator: torch.Generator)
 
 
 def _kmeans_seeds(joint: Tensor, num_codes: int, generator: torch.Generator) -> Tensor:
-    """k-means++ seeds: each is drawn in proportion to the squared distance to the nearest earlier seed.
+    """Greedy k-means++ seeds, as in scikit-learn (Arthur and Vassilvitskii 2007, section 4).
 
-    Only those features are compared with a new seed that it may be nearer to than their own seed: by the triangle
-    inequality, those more than half as far from their seed as that is from the new one.
+    Some features are drawn in proportion to the squared distance to the nearest earlier seed. The next seed is the
+    one that lowers the sum of these distances most. With a single draw, a small part such as the handle of a mug had
+    no code of its own in one fit of eight (docs/lab-notes/2026-11-language.md).
+
+    Only those features are compared with the drawn ones that may be nearer to one of them than to their own seed: by
+    the triangle inequality, those more than half as far from their seed as that is from the drawn one.
     """
-    count = len(joint)
-    seeds = [int(torch.randint(count, (1,), generator=generator))]
+    count, drawn = len(joint), 2 + int(math.log(num_codes))
+    seeds = torch.randint(count, (1,), generator=generator).to(joint.device)
     blocks = (joint[i : i + _SMALL_BLOCK] for i in range(0, count, _SMALL_BLOCK))
     norms = torch.cat([block.square().sum(-1) for block in blocks])
-    nearest = torch.full((count,), torch.inf, device=joint.device)
+    nearest = _squared_distances(joint, norms, torch.arange(count, device=joint.device), seeds)[:, 0]
     owners = torch.zeros(count, dtype=torch.long, device=joint.device)
-    for number in range(num_codes - 1):
-        latest = seeds[-1]
-        apart = _squared_distances(joint, norms, torch.tensor(seeds, device=joint.device), latest)
-        near = (apart[owners] * _SLACK <= 4 * nearest + _ROUNDING).nonzero()[:, 0]
-        squared = _squared_distances(joint, norms, near, latest)
-        nearer = squared < nearest[near]
-        near = near[nearer]
-        nearest[near], owners[near] = squared[nearer], number
+    for number in range(1, num_codes):
         cumulative = nearest.cumsum(0, dtype=torch.float64)
-        draw = torch.rand(1, generator=generator, dtype=torch.float64).to(joint.device) * cumulative[-1]
-        seeds.append(min(int(torch.searchsorted(cumulative, draw, right=True)), count - 1))
-    return torch.tensor(seeds, device=joint.device)
+        draws = torch.rand(drawn, generator=generator, dtype=torch.float64).to(joint.device) * cumulative[-1]
+        candidates = torch.searchsorted(cumulative, draws, right=True).clamp_max(count - 1)
+        apart = _squared_distances(joint, norms, seeds, candidates).amin(1)
+        near = (apart[owners] * _SLACK <= 4 * nearest + _ROUNDING).nonzero()[:, 0]
+        squared = _squared_distances(joint, norms, near, candidates)
+        best = (nearest[near, None] - squared).clamp_min(0).sum(0, dtype=torch.float64).argmax()
+        nearer = squared[:, best] < nearest[near]
+        near = near[nearer]
+        nearest[near], owners[near] = squared[nearer, best], number
+        seeds = torch.cat([seeds, candidates[best, None]])
+    return seeds
 
 
-def _squared_distances(joint: Tensor, norms: Tensor, rows: Tensor, other: int) -> Tensor:
-    """Squared distances of some features to one of them, from the squared lengths of all."""
+def _squared_distances(joint: Tensor, norms: Tensor, rows: Tensor, others: Tensor) -> Tensor:
+    """Squared distances ``[R, O]`` of some features to some others, from the squared lengths of all."""
     many = len(rows) > len(joint) // 2  # then copies take longer than products
-    products = (joint @ joint[other])[rows] if many else joint[rows] @ joint[other]
-    return (norms[rows] + norms[other] - 2 * products).clamp_min_(0)
+    products = (joint @ joint[others].T)[rows] if many else joint[rows] @ joint[others].T
+    return (norms[rows, None] + norms[others] - 2 * products).clamp_min_(0)
 
 
 def _nearest(joint: Tensor, centers: Tensor) -> tuple[Tensor, Tensor]:
