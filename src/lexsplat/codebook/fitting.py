@@ -238,7 +238,7 @@ def _kmeans_seeds(joint: Tensor, num_codes: int, generator: torch.Generator) -> 
 
     Some features are drawn in proportion to the squared distance to the nearest earlier seed. The next seed is the
     one that lowers the sum of these distances most. With a single draw, a small part such as the handle of a mug had
-    no code of its own in one fit of eight (docs/lab-notes/2026-11-language.md).
+    no code of its own in one fit of eleven (docs/lab-notes/2026-11-language.md).
 
     Only those features are compared with the drawn ones that may be nearer to one of them than to their own seed: by
     the triangle inequality, those more than half as far from their seed as that is from the drawn one.
