@@ -46,7 +46,6 @@ from lexsplat.runtime.device import choose_device, choose_encoder_device
 from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetError, ModelError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.training import Checkpoint
 from lexsplat.runtime.workers import IN_PROCESS, SharedFolder, Workers, open_workers
@@ -123,7 +122,7 @@ def build(
             sizes = [view.capture_size for view in capture.views.values()]
             config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
             capture = capture.downscaled(config.downscale or 1.0)
-            _check_photos(capture, parse_bytes(config.memory))
+            _check_photos(capture, config.memory_bytes)
             check_given_maps(config, capture)
             builder = _Builder(capture, folder, config, device, listener, splats)
             builder.encoders, builder.workers = checked, workers
@@ -182,7 +181,7 @@ class _Builder:
         self.workers: Workers = IN_PROCESS
         self.encoders: Encoders | None = None
         self.method = METHODS[config.method]
-        self.memory = parse_bytes(config.memory)
+        self.memory = config.memory_bytes
         self.blocks = number_of_blocks(config.blocks, config.reconstruction, device, self.memory)
         self.fingerprints: dict[str, str] = {}
         self.checkpoint: Checkpoint | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -124,9 +125,8 @@ class BuildConfig:
             raise ValueError(f"views_from must be auto, inside or around, got {self.views_from!r}")
         if self.encoder_device not in ("auto", "cpu", "cuda", "mps"):
             raise ValueError(f"encoder_device must be auto, cpu, cuda or mps, got {self.encoder_device!r}")
-        parse_bytes(self.memory)
         check_spec(self.workers)
-        number_of_blocks(self.blocks, self.reconstruction, "cpu", parse_bytes(self.memory))
+        number_of_blocks(self.blocks, self.reconstruction, "cpu", self.memory_bytes)
         if self.joint and self.blocks != "none":
             raise ValueError("joint training takes the capture in one piece: leave --blocks out")
         check_seed(self.seed)
@@ -166,6 +166,11 @@ class BuildConfig:
             for name in unused | {"memory", "workers", "blocks", "checkpoint_seconds", "encoder_device"}
         }
         return replace(self, features=self.features.result_settings(use_dino=self.uses_dino), **idle)
+
+    @cached_property
+    def memory_bytes(self) -> int:
+        """`memory` in bytes."""
+        return parse_bytes(self.memory)
 
     @property
     def uses_dino(self) -> bool:
