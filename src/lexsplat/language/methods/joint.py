@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,12 +22,54 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import check_views
 from lexsplat.language.fields import TrainedField
+from lexsplat.language.methods.method import FitRun, TrainingViews
+from lexsplat.language.methods.trained import Trained
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.reconstruction import EVENT_EVERY, STAGE, Reconstructor
 from lexsplat.reconstruction.optimizers import below_prefix, with_prefix
+from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.runtime.training import Checkpoint, run_training
+
+
+class TrainedJointly(Trained):
+    """The method as an object (`lexsplat.language.methods.JointMethod`)."""
+
+    stages = (*Trained.needs, "reconstruct", "language")
+
+    def geometry_inputs(self, config: Any) -> list[Any]:
+        """What the language depends on, which the same training makes."""
+        return ["codebook", config.trained]
+
+    def geometry_outputs(self, scratch: Path) -> list[Path]:
+        """The field."""
+        return [scratch / "joint_language.safetensors"]
+
+    def fit_geometry(
+        self, reconstructor: Reconstructor, views: TrainingViews, config: Any, run: FitRun
+    ) -> Gaussians:
+        """Train both and keep the field.
+
+        Raises:
+            ValueError: If there is no scratch folder, no view, or a view has no index map.
+        """
+        trainer = JointTrainer(
+            reconstructor, views.cameras, *views.require_codes(), config.trained, seed=run.seed
+        )
+        trainer.run(run.listener, run.checkpoint)
+        gaussians, field = trainer.result()
+        write_tensors(self._kept(run), field.tensors(), field.metadata())
+        return gaussians
+
+    def fit(self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> TrainedField:
+        """The field that `fit_geometry` kept."""
+        return TrainedField.from_tensors(*read_tensors(self._kept(run)))
+
+    def _kept(self, run: FitRun) -> Path:
+        if run.scratch is None:
+            raise ValueError("joint training needs a scratch folder that lasts")
+        return self.geometry_outputs(run.scratch)[0]
 
 
 class JointTrainer:

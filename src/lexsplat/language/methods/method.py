@@ -21,6 +21,7 @@ from lexsplat.runtime.progress import Listener, silent
 from lexsplat.runtime.workers import IN_PROCESS, Workers
 
 if TYPE_CHECKING:
+    from lexsplat.reconstruction import Reconstructor
     from lexsplat.runtime.training import Checkpoint
 
 Variant = Mapping[str, Mapping[str, Any]]
@@ -105,12 +106,12 @@ class LanguageMethod(Protocol):
     def needs(self) -> tuple[str, ...]:
         """Stages before "language" that it needs beside the Gaussians, in order."""
 
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """All stages of a build, in the order in which they run."""
+
     def uses_dino(self, config: Any) -> bool:
         """Whether DINO features take part in a build of these settings."""
-
-    @property
-    def trains_jointly(self) -> bool:
-        """Whether it can also be trained together with the reconstruction (``--joint``)."""
 
     @property
     def variants(self) -> Mapping[str, Variant]:
@@ -124,4 +125,26 @@ class LanguageMethod(Protocol):
             views: The training views, with what the stages in `needs` made of them.
             config: The build settings (`lexsplat.pipeline.config.BuildConfig`), of which `settings` are read.
             run: Seed, memory, checkpoint and listener.
+        """
+
+
+class JointMethod(LanguageMethod, Protocol):
+    """A method that trains the geometry, too (``--joint``). Its `fit` takes the language that `fit_geometry` kept."""
+
+    def geometry_inputs(self, config: Any) -> list[Any]:
+        """What its Gaussians depend on beside the reconstruction; the name of a stage stands for its inputs."""
+
+    def geometry_outputs(self, scratch: Path) -> list[Path]:
+        """Files in which `fit_geometry` keeps the language."""
+
+    def fit_geometry(
+        self, reconstructor: Reconstructor, views: TrainingViews, config: Any, run: FitRun
+    ) -> Gaussians:
+        """Train the Gaussians and the language; returns the Gaussians and keeps the language in ``run.scratch``.
+
+        Args:
+            reconstructor: The reconstruction, before its first step.
+            views: As in `fit`.
+            config: The build settings.
+            run: As in `fit`, with a scratch folder that lasts.
         """
