@@ -13,8 +13,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("training_tools")]
 
 
 def test_held_out_pairs_are_not_trained_as_negatives():
+    from clip_batches import leave_open
     from crops import cut
-    from train_clip import leave_open
     from truth import TruthTable
     from words import FALSE, OPEN, TRUE, Label, Phrase
 
@@ -228,7 +228,8 @@ def place_questions():
 
 
 def place_answers(frames, crops, seed=0, colorless=None, angles=None):
-    from train_clip import ClipTraining, place_truth
+    from clip_batches import place_truth
+    from clip_settings import ClipTraining
     from truth import TruthTable
 
     count = len(crops)
@@ -275,7 +276,8 @@ def test_colors_are_open_for_patches_of_gray_crops():
 
 
 def test_held_out_pairs_are_not_trained_as_negatives_of_patches():
-    from train_clip import ClipTraining, place_truth
+    from clip_batches import place_truth
+    from clip_settings import ClipTraining
     from truth import TruthTable
     from words import FALSE, OPEN, Phrase
 

@@ -49,7 +49,8 @@ def test_phrases_are_true_false_or_open_for_each_label(words, wanted, truth):
 
 
 def test_words_of_things_that_no_scene_holds_are_true_of_nothing():
-    from words import FALSE, NAMES, UNKNOWN_TESTED, UNKNOWN_TRAINED, Phrase
+    from vocabulary import NAMES, UNKNOWN_TESTED, UNKNOWN_TRAINED
+    from words import FALSE, Phrase
 
     assert not set(UNKNOWN_TESTED) & set(UNKNOWN_TRAINED)
     known = {name for names in NAMES.values() for name in names}
@@ -59,7 +60,7 @@ def test_words_of_things_that_no_scene_holds_are_true_of_nothing():
 
 def test_bundled_scenes_contain_no_held_out_pair():
     from layouts import LAYOUTS
-    from words import HELD_OUT_PAIRS
+    from vocabulary import HELD_OUT_PAIRS
 
     for layout in LAYOUTS.values():
         assert not HELD_OUT_PAIRS & {(place.kind, place.color) for place in layout.placements}
@@ -82,7 +83,7 @@ def test_the_scene_for_choosing_shares_no_thing_place_or_camera_with_the_demo():
 
 @pytest.mark.parametrize("scene", ["tabletop", "second"])
 def test_the_language_covers_every_prompt_of_the_scenes_that_ship(scene):
-    from words import COLORS, NAMES, PARTS, QUALITIES
+    from vocabulary import COLORS, NAMES, PARTS, QUALITIES
 
     single = {
         w
@@ -101,7 +102,8 @@ def test_the_language_covers_every_prompt_of_the_scenes_that_ship(scene):
 @given(seed=st.integers(0, 2**32 - 1))
 def test_no_training_phrase_names_a_held_out_pair(seed):
     # It could only be wrong, and would be learnt as the name of nothing.
-    from words import HELD_OUT_PAIRS, any_phrase, near_miss
+    from vocabulary import HELD_OUT_PAIRS
+    from words import any_phrase, near_miss
 
     rng = np.random.default_rng(seed)
     shown = [label for label in labels() if (label.kind, label.color) not in HELD_OUT_PAIRS]
@@ -121,7 +123,7 @@ def test_a_made_up_word_is_none_that_means_something():
 
 
 def test_rotated_hues_map_red_to_green_and_keep_gray():
-    from train_clip import turned_hues
+    from clip_batches import turned_hues
 
     colors = np.array([[[200, 0, 0], [90, 90, 90], [0, 200, 0]]], np.uint8)
     turned = turned_hues(colors, 120.0).astype(int)
@@ -129,7 +131,7 @@ def test_rotated_hues_map_red_to_green_and_keep_gray():
 
 
 def test_rotated_hues_never_produce_a_held_out_pair():
-    from train_clip import fair_angle
+    from clip_batches import fair_angle
     from words import Label
 
     rng = np.random.default_rng(0)
@@ -142,7 +144,7 @@ def test_rotated_hues_never_produce_a_held_out_pair():
 
 def test_the_composition_loss_of_additive_colors_is_zero():
     import torch
-    from train_clip import composition_loss
+    from clip_losses import composition_loss
 
     kinds, colors = torch.randn(2, 8), torch.randn(2, 8)
     corners = torch.stack([kinds[k] + colors[c] for k in (0, 1) for c in (0, 1)])
@@ -152,13 +154,13 @@ def test_the_composition_loss_of_additive_colors_is_zero():
 
 
 def small_training(**settings):
-    from train_clip import ClipTraining
+    from clip_settings import ClipTraining
 
     return ClipTraining(batch=12, width=64, layers=2, text_width=64, text_layers=1, dim=32, **settings)
 
 
 def batch_of(config, seed=0):
-    from train_clip import make_batch
+    from clip_batches import make_batch
     from truth import TruthTable
 
     frames = frames_with_a_handle(scale=4)
@@ -174,7 +176,7 @@ def trainer_of(config, start=None):
 
 def test_labels_of_patches_follow_a_mirrored_crop():
     import torch
-    from train_clip import Batch, mirrored
+    from clip_batches import Batch, mirrored
 
     config = small_training(dense=1.0)
     # Each patch is of one brightness, which all that belongs to it repeats.
@@ -202,7 +204,7 @@ def test_labels_of_patches_follow_a_mirrored_crop():
 
 
 def test_only_the_last_phase_of_the_weights_that_ship_asks_patches():
-    from train_clip import PHASES, ClipTraining
+    from clip_settings import PHASES, ClipTraining
 
     assert ClipTraining().dense == 0
     assert [name for name, config in PHASES.items() if config.dense] == ["dense"]
@@ -229,8 +231,9 @@ def test_the_dense_loss_trains_the_image_tower_except_its_last_attention_weights
 
 def test_the_dense_loss_ignores_open_patches_and_prefers_correct_answers():
     import torch
-    from train_clip import dense_loss
-    from words import CANONICAL, FALSE, OPEN, TRUE
+    from clip_losses import dense_loss
+    from vocabulary import CANONICAL
+    from words import FALSE, OPEN, TRUE
 
     axes = torch.eye(8)
     texts = torch.cat([axes[:2], axes[2].expand(len(CANONICAL), -1)])  # two phrases, all canonical ones equal
@@ -249,7 +252,8 @@ def test_the_dense_loss_ignores_open_patches_and_prefers_correct_answers():
 
 def test_training_and_encoder_compute_the_same_patch_embeddings(tmp_path, monkeypatch):
     import torch
-    from train_clip import MEAN, STD, save
+    from clip_batches import MEAN, STD
+    from train_clip import save
 
     from lexsplat.features import pretrained
     from lexsplat.features.clip import ClipEncoder

@@ -24,7 +24,8 @@ def frames_with_a_handle(scale=1):
 
 def labels():
     """Every kind in every color, whole and in parts."""
-    from words import COLORS, NAMES, OWNERS, Label
+    from vocabulary import COLORS, NAMES, OWNERS
+    from words import Label
 
     finishes = {"table": "wooden", "wall": "brick", "cloth": "checkered", "floor": "tiled"}
     parts = {kind: [None] + [part for part, owners in OWNERS.items() if kind in owners] for kind in NAMES}
