@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from lexsplat.captures import Capture
 from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
@@ -57,39 +57,19 @@ class GeometryRun:
         )
 
 
-class Geometry(Protocol):
-    """A way to the Gaussians of a build."""
+class Geometry:
+    """A way to the Gaussians of a build: one reconstruction of the whole capture, where no other is asked for."""
 
     def inputs(self, config: BuildConfig, device: str) -> list[Any]:
         """What its Gaussians depend on beside photos and cameras; the name of a stage stands for its inputs."""
-
-    def outputs(self, checkpoints: Path) -> list[Path]:
-        """What it writes beside the Gaussians."""
-
-    def make(self, config: BuildConfig, run: GeometryRun) -> tuple[Gaussians, dict[str, Any]]:
-        """The Gaussians, and facts for the record of the stage."""
-
-
-def way_to_geometry(config: BuildConfig, device: str, splats: Path | None) -> Geometry:
-    """The way that the settings ask for; given splats come before all others."""
-    if splats is not None:
-        return _Given(splats)
-    if config.joint:
-        return _WithLanguage(JOINT_METHODS[config.method])
-    blocks = number_of_blocks(config.blocks, config.reconstruction, device, config.memory_bytes)
-    return _InBlocks(blocks) if blocks > 1 else _Whole()
-
-
-class _Whole:
-    """One reconstruction of the whole capture."""
-
-    def inputs(self, config: BuildConfig, device: str) -> list[Any]:
         return [config.reconstruction, config.seed, device]
 
     def outputs(self, checkpoints: Path) -> list[Path]:
+        """What it writes beside the Gaussians."""
         return []
 
     def make(self, config: BuildConfig, run: GeometryRun) -> tuple[Gaussians, dict[str, Any]]:
+        """The Gaussians, and facts for the record of the stage."""
         gaussians = reconstruct(
             run.capture,
             config.reconstruction,
@@ -104,7 +84,7 @@ class _Whole:
 
 
 @dataclass(frozen=True)
-class _InBlocks(_Whole):
+class _InBlocks(Geometry):
     """A reconstruction of one block after the other, or of several on workers."""
 
     blocks: int
@@ -126,7 +106,7 @@ class _InBlocks(_Whole):
 
 
 @dataclass(frozen=True)
-class _WithLanguage(_Whole):
+class _WithLanguage(Geometry):
     """A reconstruction whose every step is followed by one of the language."""
 
     method: JointMethod
@@ -147,7 +127,7 @@ class _WithLanguage(_Whole):
 
 
 @dataclass(frozen=True)
-class _Given:
+class _Given(Geometry):
     """The Gaussians of another program, if they show what the photos show."""
 
     path: Path
@@ -155,11 +135,18 @@ class _Given:
     def inputs(self, config: BuildConfig, device: str) -> list[Any]:
         return [splats_hash(self.path)]
 
-    def outputs(self, checkpoints: Path) -> list[Path]:
-        return []
-
     def make(self, config: BuildConfig, run: GeometryRun) -> tuple[Gaussians, dict[str, Any]]:
         splats = existing_splats(self.path)
         gaussians = splats_of_capture(splats, run.capture, run.folder)
         check_agreement(gaussians, list(run.capture.train_views), splats)
         return gaussians, {"splats": str(splats.resolve())}
+
+
+def way_to_geometry(config: BuildConfig, device: str, splats: Path | None) -> Geometry:
+    """The way that the settings ask for; given splats come before all others."""
+    if splats is not None:
+        return _Given(splats)
+    if config.joint:
+        return _WithLanguage(JOINT_METHODS[config.method])
+    blocks = number_of_blocks(config.blocks, config.reconstruction, device, config.memory_bytes)
+    return _InBlocks(blocks) if blocks > 1 else Geometry()

@@ -140,11 +140,4 @@ class JointMethod(LanguageMethod, Protocol):
     def fit_geometry(
         self, reconstructor: Reconstructor, views: TrainingViews, config: Any, run: FitRun
     ) -> Gaussians:
-        """Train the Gaussians and the language; returns the Gaussians and keeps the language in ``run.scratch``.
-
-        Args:
-            reconstructor: The reconstruction, before its first step.
-            views: As in `fit`.
-            config: The build settings.
-            run: As in `fit`, with a scratch folder that lasts.
-        """
+        """Train both from before the first step of the reconstruction; ``run.scratch`` keeps the language."""
