@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -104,31 +103,18 @@ class JointTrainer:
     ) -> None:
         check_views(sorted(cameras), code_maps)
         reconstructor.tracks_origins = True
-        self.reconstructor, self.code_maps, self.codebook, self.seed = (
-            reconstructor,
-            code_maps,
-            codebook,
-            seed,
-        )
+        self.reconstructor, self.code_maps = reconstructor, code_maps
+        self.codebook, self.seed = codebook, seed
+        self.device, self.total_steps = reconstructor.device, reconstructor.total_steps
         self.config = replace(config, iterations=reconstructor.config.iterations)
         self.cameras = {name: camera.downscaled(config.render_downscale) for name, camera in cameras.items()}
         self.language = FieldTrainer(reconstructor.gaussians(), codebook, self.config, seed=seed)
         self._losses = {"loss": float("nan")}
 
     @property
-    def device(self) -> torch.device:
-        """Where the training runs."""
-        return self.reconstructor.device
-
-    @property
     def steps_done(self) -> int:
         """Number of finished steps."""
         return self.reconstructor.steps_done
-
-    @property
-    def total_steps(self) -> int:
-        """Number of steps of the whole training."""
-        return self.reconstructor.total_steps
 
     @property
     def metrics(self) -> dict[str, float]:

@@ -289,11 +289,7 @@ def _write_folder(folder: Path, manifest: dict[str, Any], target: Path) -> int:
 
 
 def _write_single(folder: Path, manifest: dict[str, Any], target: Path) -> int:
-    """Write one HTML file that holds all files as base64; returns its size.
-
-    Raises:
-        SceneFolderError: If they are too large.
-    """
+    """Write one HTML file that holds all files as base64; returns its size."""
     data = [path for path in sorted(folder.iterdir()) if path.name not in ("page.js", "page.css")]
     size = sum(path.stat().st_size for path in data)
     if size > SINGLE_FILE_BYTES:
