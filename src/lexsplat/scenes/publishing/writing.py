@@ -38,12 +38,7 @@ from lexsplat.scenes.publishing.sidecar import (
 )
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.text_tower import write_text_tower
-from lexsplat.scenes.publishing.vocabulary import (
-    asked_phrases,
-    page_phrases,
-    phrase_answers,
-    words_file,
-)
+from lexsplat.scenes.publishing.vocabulary import asked_phrases, page_phrases, phrase_answers, words_file
 from lexsplat.scenes.scene import Scene
 
 MOST_SPLATS = 4_000_000
