@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +44,7 @@ from lexsplat.evaluation.summary import mean_of, precision_curves, summarize_kin
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import render
+from lexsplat.runtime.device import kernel_threads
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.scene import Scene
@@ -211,10 +213,12 @@ class _Evaluation:
         for size in sorted({mask.shape for mask in ground_truth.values()}):
             prompts = [prompt for prompt, mask in ground_truth.items() if mask.shape == size]
             relevancy |= self._at_size(view.camera, size, {prompt: working[prompt] for prompt in prompts})
-        self.pairs[view.name] = {
-            prompt: self._pair(view, prompt, relevancy[prompt], working[prompt], mask)
-            for prompt, mask in ground_truth.items()
-        }
+
+        def measured(prompt: str) -> PairResult:
+            return self._pair(view, prompt, relevancy[prompt], working[prompt], ground_truth[prompt])
+
+        with ThreadPoolExecutor(kernel_threads()) as pool:  # counting and sorting release the GIL
+            self.pairs[view.name] = dict(zip(ground_truth, pool.map(measured, ground_truth)))
         return relevancy, ground_truth
 
     def _pair(

@@ -112,7 +112,8 @@ def average_precision(scores: ArrayLike, ground_truth: ArrayLike) -> float:
     values, mask = _scores(scores, ground_truth)
     if not mask.any():
         return math.nan
-    ranked, hits = np.sort(values), np.sort(values[mask])
+    hits = np.sort(values[mask])
+    ranked = np.sort(values[values >= hits[0]])  # no threshold predicts the others
     found = np.arange(
         len(hits), 0, -1
     )  # from the lowest threshold to the highest; of ties the first one counts
