@@ -123,7 +123,8 @@ class _WithLanguage(Geometry):
         reconstructor = Reconstructor(
             run.capture, config.reconstruction, points, device=run.device, seed=config.seed, memory=memory
         )
-        return self.method.fit_geometry(reconstructor, run.codes(), config, run.fit), {"joint": True}
+        training = self.method.joined(reconstructor, run.codes(), config, config.seed)
+        return self.method.fit_geometry(training, run.fit), {"joint": True}
 
 
 @dataclass(frozen=True)

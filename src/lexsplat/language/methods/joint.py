@@ -45,19 +45,20 @@ class TrainedJointly(Trained):
         """The field."""
         return [scratch / "joint_language.safetensors"]
 
-    def fit_geometry(
-        self, reconstructor: Reconstructor, views: TrainingViews, config: Any, run: FitRun
-    ) -> Gaussians:
+    def joined(
+        self, reconstructor: Reconstructor, views: TrainingViews, config: Any, seed: int
+    ) -> JointTrainer:
+        """A `JointTrainer` with the index maps of the training views."""
+        return JointTrainer(reconstructor, views.cameras, *views.require_codes(), config.trained, seed=seed)
+
+    def fit_geometry(self, training: JointTrainer, run: FitRun) -> Gaussians:
         """Train both and keep the field.
 
         Raises:
-            ValueError: If there is no scratch folder, no view, or a view has no index map.
+            ValueError: If there is no scratch folder.
         """
-        trainer = JointTrainer(
-            reconstructor, views.cameras, *views.require_codes(), config.trained, seed=run.seed
-        )
-        trainer.run(run.listener, run.checkpoint)
-        gaussians, field = trainer.result()
+        training.run(run.listener, run.checkpoint)
+        gaussians, field = training.result()
         write_tensors(self._kept(run), field.tensors(), field.metadata())
         return gaussians
 

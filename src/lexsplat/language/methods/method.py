@@ -21,6 +21,7 @@ from lexsplat.runtime.progress import Listener, silent
 from lexsplat.runtime.workers import IN_PROCESS, Workers
 
 if TYPE_CHECKING:
+    from lexsplat.language.methods.joint import JointTrainer
     from lexsplat.reconstruction import Reconstructor
     from lexsplat.runtime.training import Checkpoint
 
@@ -137,7 +138,10 @@ class JointMethod(LanguageMethod, Protocol):
     def geometry_outputs(self, scratch: Path) -> list[Path]:
         """Files in which `fit_geometry` keeps the language."""
 
-    def fit_geometry(
-        self, reconstructor: Reconstructor, views: TrainingViews, config: Any, run: FitRun
-    ) -> Gaussians:
-        """Train both from before the first step of the reconstruction; ``run.scratch`` keeps the language."""
+    def joined(
+        self, reconstructor: Reconstructor, views: TrainingViews, config: Any, seed: int
+    ) -> JointTrainer:
+        """The training of both, before its first step and that of the reconstruction."""
+
+    def fit_geometry(self, training: JointTrainer, run: FitRun) -> Gaussians:
+        """Run the training; returns the Gaussians and keeps the language in ``run.scratch``."""
