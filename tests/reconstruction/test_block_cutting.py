@@ -11,7 +11,6 @@ from support.street import street
 from support.tiny_capture import QUICK_BUILD
 
 from lexsplat import cli
-from lexsplat.captures import Capture, load_capture
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import look_at
 from lexsplat.reconstruction.block_files import plan
@@ -26,11 +25,6 @@ from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.runtime.errors import CaptureError
 
 UP = Up(np.array([0.0, 0.0, 1.0]), True)
-
-
-@pytest.fixture(scope="module")
-def capture(tiny_capture) -> Capture:
-    return load_capture(tiny_capture)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 9])

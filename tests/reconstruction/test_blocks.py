@@ -10,7 +10,6 @@ from support.street import street
 from support.tiny_capture import QUICK_BUILD
 
 from lexsplat import cli
-from lexsplat.captures import Capture, load_capture
 from lexsplat.captures.sfm.triangulation import InitialPoints
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.gaussians import Gaussians
@@ -27,11 +26,6 @@ from lexsplat.scenes.folder import SceneFolder
 
 UP = Up(np.array([0.0, 0.0, 1.0]), True)
 CONFIG = ReconstructionConfig(iterations=30, max_gaussians=600, sh_degree=0)
-
-
-@pytest.fixture(scope="module")
-def capture(tiny_capture) -> Capture:
-    return load_capture(tiny_capture)
 
 
 @pytest.fixture
