@@ -40,7 +40,6 @@ from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.encoding import Encoders, feature_maps
 from lexsplat.rendering import PreparedView
 from lexsplat.rendering.back_projection import DenseCellWeights, cell_of
-from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Event
 from lexsplat.scenes.folder import SceneFolder
 
@@ -163,9 +162,7 @@ def timed_fit(gaussians: Gaussians, views: TrainingViews, config: BuildConfig) -
     def listener(event: Event) -> None:
         last[event.stage] = time.process_time() - start
 
-    field = Averaged().fit(
-        gaussians, views, config, FitRun(memory=parse_bytes(config.memory), listener=listener)
-    )
+    field = Averaged().fit(gaussians, views, config, FitRun(memory=config.memory_bytes, listener=listener))
     print("  ended after", {stage: f"{seconds:.1f} CPU s" for stage, seconds in last.items()}, flush=True)
     return field.weights
 

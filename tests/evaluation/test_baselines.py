@@ -13,15 +13,16 @@ from support.language_scene import CENTERS, IGNORED, LanguageScene, make_scene
 
 from lexsplat.evaluation import Method
 from lexsplat.evaluation.baselines import (
+    BaselineRun,
+    Dff,
     DffConfig,
     GaussianFeatures,
+    Lerf,
     LerfConfig,
+    Ovs3d,
     Ovs3dConfig,
     TrainingData,
     ViewFeatures,
-    distill,
-    fit_3dovs,
-    fit_lerf,
 )
 from lexsplat.evaluation.baselines.feature_rendering import TrainingViews, back_projected_mean, render_cosines
 from lexsplat.evaluation.baselines.lerf import level_weights, smooth_by_similarity
@@ -122,7 +123,8 @@ def test_cosines_in_chunks_are_those_of_the_whole_feature(balls):
 
 
 def test_distilled_features_find_the_balls(balls, maps):
-    found = distill(TrainingData(balls.gaussians, balls.cameras, maps), DffConfig(steps=20))
+    data = TrainingData(balls.gaussians, balls.cameras, maps)
+    found = Dff(DffConfig(steps=20)).fit(data, BaselineRun({}))
     assert isinstance(found, Method)
     assert ball_scores(found, balls) > 0.85
     assert pixel_accuracy(found, balls) > 0.9
@@ -144,11 +146,11 @@ def test_distilling_moves_from_the_mean_towards_the_least_squares_solution_and_i
         return float((system @ features.double() - target).square().mean())
 
     data = TrainingData(balls.gaussians, balls.cameras, noisy)
-    average = distill(data, DffConfig(steps=0))
-    fitted = distill(data, DffConfig(steps=40, learning_rate=0.05))
+    average = Dff(DffConfig(steps=0)).fit(data, BaselineRun({}))
+    fitted = Dff(DffConfig(steps=40, learning_rate=0.05)).fit(data, BaselineRun({}))
     left = (error(fitted.features[0]) - error(best)) / (error(average.features[0]) - error(best))
     assert 0 <= left < 0.6
-    again = distill(data, DffConfig(steps=40, learning_rate=0.05))
+    again = Dff(DffConfig(steps=40, learning_rate=0.05)).fit(data, BaselineRun({}))
     torch.testing.assert_close(fitted.features, again.features)
 
 
@@ -208,9 +210,8 @@ def test_lerf_finds_the_balls(balls, maps):
         blur = torch.eye(DIM)[BALLS].expand_as(maps[name].clip)
         return torch.stack([maps[name].clip, blur]), [0.1, 0.6]
 
-    found = fit_lerf(
-        TrainingData(balls.gaussians, balls.cameras, maps, levels), LerfConfig(scales=2, neighbors=3)
-    )
+    data = TrainingData(balls.gaussians, balls.cameras, maps, levels)
+    found = Lerf(LerfConfig(scales=2, neighbors=3)).fit(data, BaselineRun({}))
     assert isinstance(found, Method)
     assert found.features.shape == (2, len(balls.gaussians), DIM)
     assert float(found.scales[0]) < float(found.scales[1])
@@ -250,14 +251,14 @@ def test_3dovs_separates_the_classes_and_one_half_selects_the_best_class(balls, 
 
     classes = torch.cat([WORDS, OTHER])
     data = TrainingData(balls.gaussians, balls.cameras, maps, levels)
-    found = fit_3dovs(data, classes, Ovs3dConfig(steps=15, pairs=32))
+    found = Ovs3d(Ovs3dConfig(steps=15, pairs=32)).fit(data, BaselineRun({}, classes))
     assert isinstance(found, Method)
     assert ball_scores(found, balls) > 0.85
     scores = found.gaussian_scores(Question(classes, OTHER))
     known = found.features.norm(dim=1) > 0
     assert ((scores >= 0.5).sum(0)[known] == 1).all(), "one class is the best of all"
     with pytest.raises(ValueError, match="two classes"):
-        fit_3dovs(data, WORDS[:1])
+        Ovs3d().fit(data, BaselineRun({}, WORDS[:1]))
 
 
 # nearest

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import logging
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -13,13 +12,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support.encoder_folders import MEAN, STD, save_model, seeded, tiny_vit
+from support.encoder_folders import normalized, save_model, seeded, unit
 
 from lexsplat.features import hub, pretrained
 from lexsplat.features.clip import check_patches
 from lexsplat.features.clip_image import ClipImages
-from lexsplat.features.dino import _ramp, _window_starts
-from lexsplat.features.encoders import ClipEncoder, DinoEncoder, load_clip, load_dino, resize_images
+from lexsplat.features.encoders import ClipEncoder, load_clip, load_dino, resize_images
 from lexsplat.runtime.errors import ModelError
 
 PROMPTS = ["a red apple", "the wooden table", "stack of books next to a lamp"]
@@ -58,15 +56,6 @@ def test_bfloat16_is_chosen_by_its_time_where_the_processor_has_instructions(fla
     assert pretrained.bfloat16_is_faster.__wrapped__() is chosen
 
 
-def _normalized(images: torch.Tensor) -> torch.Tensor:
-    pixels = (images.double().numpy() - np.reshape(MEAN, (3, 1, 1))) / np.reshape(STD, (3, 1, 1))
-    return torch.from_numpy(pixels).float()
-
-
-def _unit(features: torch.Tensor) -> torch.Tensor:
-    return features / features.norm(dim=-1, keepdim=True)
-
-
 def _images(count: int, size: int) -> torch.Tensor:
     return torch.rand(count, 3, size, size, generator=torch.Generator().manual_seed(1))
 
@@ -99,8 +88,8 @@ def test_clip_image_embeddings_equal_transformers_own(clip_folder):
     images = _images(5, 40)
     with torch.no_grad():
         model = CLIPModel.from_pretrained(clip_folder)
-        pooled = model.vision_model(pixel_values=_normalized(images)).pooler_output
-        expected = _unit(model.visual_projection(pooled))
+        pooled = model.vision_model(pixel_values=normalized(images)).pooler_output
+        expected = unit(model.visual_projection(pooled))
     assert (encoder.image_size, encoder.dim) == (40, 20)
     torch.testing.assert_close(encoder.encode_images(images), expected, atol=1e-5, rtol=0)
 
@@ -132,7 +121,7 @@ def test_patches_are_the_values_of_the_last_attention_layer(clip_folder):
     model = CLIPModel.from_pretrained(clip_folder, attn_implementation="eager").eval()
     tower = model.vision_model
     with torch.no_grad():
-        hidden = tower(pixel_values=_normalized(images), output_hidden_states=True).hidden_states[-2]
+        hidden = tower(pixel_values=normalized(images), output_hidden_states=True).hidden_states[-2]
         last = tower.encoder.layers[-1]
 
         def norm(x, module):
@@ -150,7 +139,7 @@ def test_patches_are_the_values_of_the_last_attention_layer(clip_folder):
     whole, patches = encoder.encode_patches(images)
     torch.testing.assert_close(whole, encoder.encode_images(images))
     assert encoder.patches == 5
-    torch.testing.assert_close(patches, _unit(tokens[:, 1:]).reshape(3, 5, 5, 20), atol=1e-5, rtol=0)
+    torch.testing.assert_close(patches, unit(tokens[:, 1:]).reshape(3, 5, 5, 20), atol=1e-5, rtol=0)
 
 
 def test_the_encoder_frees_its_activations_after_each_call(clip_folder):
@@ -202,7 +191,7 @@ def test_clip_text_embeddings_equal_transformers_own_and_long_prompts_are_trunca
         ids = ids if len(ids) <= 11 else [*ids[:10], tokenizer.eos_token_id]
         with torch.no_grad():
             expected = model.text_projection(model.text_model(input_ids=torch.tensor([ids])).pooler_output)
-        torch.testing.assert_close(row, _unit(expected)[0], atol=1e-5, rtol=0)
+        torch.testing.assert_close(row, unit(expected)[0], atol=1e-5, rtol=0)
 
 
 def test_siglip_embeddings_equal_transformers_own(siglip_folder):
@@ -214,12 +203,12 @@ def test_siglip_embeddings_equal_transformers_own(siglip_folder):
     # Padded to the full length of 9 with <pad> = 0, no mask, lower case.
     ids = torch.tensor([[2, 3, 4, 0, 0, 0, 0, 0, 0], [5, 6, 7, 0, 0, 0, 0, 0, 0]])
     with torch.no_grad():
-        by_image = model.vision_model(pixel_values=_normalized(images)).pooler_output
+        by_image = model.vision_model(pixel_values=normalized(images)).pooler_output
         by_text = model.text_model(input_ids=ids).pooler_output
     assert (encoder.image_size, encoder.dim) == (32, 24)
-    torch.testing.assert_close(encoder.encode_images(images), _unit(by_image), atol=1e-5, rtol=0)
+    torch.testing.assert_close(encoder.encode_images(images), unit(by_image), atol=1e-5, rtol=0)
     found = encoder.encode_text(["A red apple", "the wooden table"])
-    torch.testing.assert_close(found, _unit(by_text), atol=1e-5, rtol=0)
+    torch.testing.assert_close(found, unit(by_text), atol=1e-5, rtol=0)
 
 
 def test_siglip2_of_variable_size_gets_the_patches_of_its_own_processor(tmp_path):
@@ -241,7 +230,7 @@ def test_siglip2_of_variable_size_gets_the_patches_of_its_own_processor(tmp_path
     encoder = ClipEncoder(tmp_path, "tiny siglip2")
     assert encoder.image_size == 32
     images = _images(2, 32)
-    pixels = _normalized(images)
+    pixels = normalized(images)
     patches = torch.stack([
         torch.stack([
             image[:, 8 * row : 8 * row + 8, 8 * col : 8 * col + 8].permute(1, 2, 0).reshape(-1)
@@ -251,11 +240,11 @@ def test_siglip2_of_variable_size_gets_the_patches_of_its_own_processor(tmp_path
     ])  # fmt: skip
     with torch.no_grad():
         expected = model.vision_model(patches, torch.ones(2, 16), torch.tensor([[4, 4]] * 2)).pooler_output
-    torch.testing.assert_close(encoder.encode_images(images), _unit(expected), atol=1e-5, rtol=0)
+    torch.testing.assert_close(encoder.encode_images(images), unit(expected), atol=1e-5, rtol=0)
     ids = torch.tensor([[words.index(letter) for letter in "a\u2581car"] + [0] * 7])  # padded behind the text
     with torch.no_grad():
         expected = model.text_model(input_ids=ids).pooler_output
-    torch.testing.assert_close(encoder.encode_text(["A car"]), _unit(expected), atol=1e-5, rtol=0)
+    torch.testing.assert_close(encoder.encode_text(["A car"]), unit(expected), atol=1e-5, rtol=0)
 
 
 def test_an_empty_prompt_is_refused():
@@ -274,169 +263,6 @@ def test_resizing_equals_pillow_bicubic(source, target):
     for plane, resized in zip(image, found):
         expected = Image.fromarray(plane.numpy()).resize((target[1], target[0]), Image.Resampling.BICUBIC)
         np.testing.assert_allclose(resized.numpy(), np.clip(np.asarray(expected), 0, 1), atol=2e-5)
-
-
-def _dinov2(registers: int):
-    import transformers
-
-    sizes = {"hidden_size": 24, "num_hidden_layers": 3, "num_attention_heads": 2}
-    options = {**sizes, "image_size": 28, "patch_size": 14}
-    if not registers:
-        return transformers.Dinov2Model(transformers.Dinov2Config(**options))
-    config = transformers.Dinov2WithRegistersConfig(**options, num_register_tokens=registers)
-    return transformers.Dinov2WithRegistersModel(config)
-
-
-def _dinov3(registers: int):
-    transformers = pytest.importorskip("transformers")
-    if not hasattr(transformers, "DINOv3ViTModel"):
-        pytest.skip("this transformers has no DINOv3")
-    config = transformers.DINOv3ViTConfig(
-        hidden_size=24, intermediate_size=40, num_hidden_layers=3, num_attention_heads=2, image_size=32,
-        patch_size=16, num_register_tokens=registers,
-    )  # fmt: skip
-    return transformers.DINOv3ViTModel(config)
-
-
-@pytest.mark.parametrize(("build", "registers"), [(tiny_vit, 0), (_dinov2, 0), (_dinov2, 4), (_dinov3, 3)])
-def test_dense_tokens_and_keys_equal_transformers_own_without_special_tokens(build, registers, tmp_path):
-    model = seeded(lambda: build(registers))
-    encoder = DinoEncoder(save_model(model, tmp_path), "tiny")
-    patch = encoder.patch_size
-    rows, cols = 3, 5
-    image = torch.rand(3, rows * patch, cols * patch, generator=torch.Generator().manual_seed(3))
-    options = {"interpolate_pos_encoding": True} if build is tiny_vit else {}
-    with torch.no_grad():
-        output = model(_normalized(image[None]), output_hidden_states=True, **options)
-    expected = output.last_hidden_state[0, 1 + registers :].reshape(rows, cols, 24)
-    found = encoder.encode_dense(image, short_side=rows * patch, facet="token")
-    assert encoder.num_layers == 3
-    torch.testing.assert_close(found, _unit(expected), atol=1e-5, rtol=0)
-
-    # Keys of layer 1 by hand: its input, through its first normalization and its key projection.
-    layers = [(n, m) for n, m in model.named_modules() if n.endswith("layer.1") or n.endswith("layers.1")]
-    layer = layers[0][1]
-    norm = next(m for n, m in layer.named_modules() if n in ("norm1", "layernorm_before"))
-    key = next(m for n, m in layer.named_modules() if n.endswith(("k_proj", ".key")))
-    with torch.no_grad():
-        expected = key(norm(output.hidden_states[1]))[0, 1 + registers :].reshape(rows, cols, 24)
-    found = encoder.encode_dense(image, short_side=rows * patch, facet="key", layer=1)
-    torch.testing.assert_close(found, _unit(expected), atol=1e-5, rtol=0)
-
-
-@pytest.fixture(scope="module")
-def dino(tmp_path_factory) -> DinoEncoder:
-    return DinoEncoder(save_model(seeded(tiny_vit), tmp_path_factory.mktemp("vit")), "tiny")
-
-
-def test_a_smaller_stride_evaluates_the_model_on_shifted_images(dino):
-    image = torch.rand(3, 32, 48, generator=torch.Generator().manual_seed(4))
-    fine = dino.encode_dense(image, short_side=32, stride=2, facet="token")
-    assert fine.shape == (16, 24, 24)
-    # Cell 4 k + 2 of the fine grid has its center at 8 k + 5: the patch that starts at 8 k + 1.
-    padded = torch.nn.functional.pad(image[None], (3, 3, 3, 3), mode="replicate")[0]
-    shifted = padded[:, 3 + 1 : 3 + 1 + 32, 3 - 1 : 3 - 1 + 48]
-    expected = dino.encode_dense(shifted, short_side=32, facet="token")
-    torch.testing.assert_close(fine[2::4, 1::4], expected, atol=1e-5, rtol=0)
-
-
-def test_fine_features_are_aligned_with_the_image(tmp_path):
-    """With a model that only averages color, features of a ramp must be the ramp at the cells' centers."""
-    model = tiny_vit(hidden_size=4, intermediate_size=4, num_hidden_layers=1, num_attention_heads=1)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.zero_()
-        # Channels (mean red, its negative, 1, -1): zero mean, so that normalizing keeps the ratio.
-        weight = model.embeddings.patch_embeddings.projection.weight
-        weight[0, 0], weight[1, 0] = 1 / 64, -1 / 64
-        model.embeddings.patch_embeddings.projection.bias[:] = torch.tensor([0.0, 0.0, 1.0, -1.0])
-        for module in model.modules():
-            if isinstance(module, torch.nn.LayerNorm):
-                module.weight.fill_(1.0)
-    folder = save_model(model, tmp_path)
-    (folder / "preprocessor_config.json").write_text(
-        json.dumps({"image_mean": [0] * 3, "image_std": [1] * 3})
-    )
-    encoder = DinoEncoder(folder, "color")
-    ramp = (torch.arange(64) + 0.5) / 64
-    image = ramp.expand(3, 32, 64)
-    for stride, tolerance in ((8, 1e-4), (2, 1e-4), (4, 1e-4)):
-        found = encoder.encode_dense(image, short_side=32, stride=stride, facet="token")
-        red = found[..., 0] / found[..., 2]
-        centers = (torch.arange(64 // stride) + 0.5) * stride / 64
-        inner = slice(4 // stride + 1, -4 // stride - 1)  # border patches see replicated pixels
-        assert (red[:, inner] - centers[inner]).abs().max() < tolerance
-
-
-def test_windows_of_a_large_image_agree_with_one_pass_for_a_local_model(dino, tmp_path):
-    image = torch.rand(3, 64, 120, generator=torch.Generator().manual_seed(5))
-    whole = dino.encode_dense(image, short_side=64, facet="token")
-    windowed = dino.encode_dense(image, short_side=64, facet="token", max_tokens=20)
-    assert windowed.shape == whole.shape
-    torch.testing.assert_close(windowed.norm(dim=-1), torch.ones(8, 15), atol=1e-5, rtol=0)
-    # Without attention and positions a token depends on its patch alone, so windows change nothing.
-    model = seeded(tiny_vit)
-    with torch.no_grad():
-        model.embeddings.position_embeddings.zero_()
-        for name, parameter in model.named_parameters():
-            if "v_proj" in name or "attention.value" in name:
-                parameter.zero_()
-    local = DinoEncoder(save_model(model, tmp_path), "local")
-    whole = local.encode_dense(image, short_side=64, facet="token")
-    windowed = local.encode_dense(image, short_side=64, facet="token", max_tokens=20)
-    torch.testing.assert_close(windowed, whole, atol=1e-5, rtol=0)
-
-
-def test_attention_never_sees_more_patches_than_allowed(dino, monkeypatch):
-    seen = []
-
-    def counted(pixels, facet, layer):
-        rows, cols = pixels.shape[-2] // 8, pixels.shape[-1] // 8
-        seen.append(rows * cols)
-        return torch.ones(rows, cols, 24)
-
-    monkeypatch.setattr(dino, "_forward", counted)
-    for height, width, limit in ((64, 120, 20), (32, 400, 7), (400, 32, 7), (64, 64, 1)):
-        seen.clear()
-        dino.encode_dense(torch.rand(3, height, width), short_side=min(height, width), max_tokens=limit)
-        assert seen
-        assert max(seen) <= limit
-
-
-@pytest.mark.parametrize(("total", "window"), [(5, 9), (9, 9), (10, 9), (100, 7), (13, 1), (64, 16)])
-def test_windows_cover_everything_and_overlap(total, window):
-    starts = _window_starts(total, window)
-    covered = np.zeros(total, dtype=int)
-    for start in starts:
-        assert 0 <= start <= max(0, total - window)
-        covered[start : start + window] += 1
-    assert covered.min() >= 1
-    assert (_ramp(window) > 0).all()
-    if window >= 4:
-        assert max(np.diff(starts), default=0) <= window - window // 4 + 1
-
-
-def test_each_thread_gets_its_own_keys(dino):
-    images = [torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(seed)) for seed in range(6)]
-    expected = [dino.encode_dense(image, short_side=32) for image in images]
-    barrier = threading.Barrier(3)
-
-    def work(index: int) -> list[torch.Tensor]:
-        barrier.wait()
-        return [dino.encode_dense(images[i], short_side=32) for i in range(index, 6, 3)]
-
-    with ThreadPoolExecutor(3) as pool:
-        for index, found in enumerate(pool.map(work, range(3))):
-            for tensor, reference in zip(found, expected[index::3]):
-                torch.testing.assert_close(tensor, reference, atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize(
-    "options", [{"stride": 0}, {"facet": "value"}, {"layer": 3}, {"layer": -4}]
-)  # the tiny model has three layers
-def test_bad_dense_options_are_refused(dino, options):
-    with pytest.raises(ValueError):
-        dino.encode_dense(torch.rand(3, 32, 32), **options)
 
 
 def test_the_content_hash_follows_the_weights_and_the_configuration(clip_folder, tmp_path):

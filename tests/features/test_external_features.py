@@ -210,7 +210,7 @@ def replaced(array: np.ndarray, ending: str = "_s.npy"):
 def test_segments_of_another_size_are_reported_before_structure_from_motion_and_reconstruction(
     tiny_capture, segments, tmp_path, monkeypatch, change, told
 ):
-    monkeypatch.setattr("lexsplat.pipeline.build.reconstruct", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr("lexsplat.pipeline.geometry.reconstruct", lambda *_, **__: pytest.fail("too late"))
     monkeypatch.setattr(
         "lexsplat.pipeline.inputs.poses_from_photos", lambda *_, **__: pytest.fail("too late")
     )

@@ -1,4 +1,4 @@
-"""Feature extraction: the cache on disk, what it depends on, memory, and features from elsewhere."""
+"""Feature extraction: the cache on disk, what it depends on, memory, and the settings."""
 
 from __future__ import annotations
 
@@ -13,22 +13,15 @@ import torch.nn.functional as F
 from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from support.counting_encoders import ColorEncoder, GridEncoder
 from support.noise_photos import HEIGHT, WIDTH, FakeLens, FakeView, make_capture
 
 from lexsplat.captures import Capture
-from lexsplat.features import (
-    FeatureConfig,
-    FeatureMap,
-    FeatureMaps,
-    TextCache,
-    extract_features,
-    load_external_features,
-)
+from lexsplat.features import FeatureConfig, FeatureMap, FeatureMaps, extract_features
 from lexsplat.features.cache import resize_grid
 from lexsplat.features.pyramid import cut_crops, dense_map, grid_levels, mean_map, patch_map
 from lexsplat.geometry.cameras import Camera
 from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetError
-from lexsplat.runtime.files import write_tensors
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -38,52 +31,6 @@ def two_threads():
     torch.set_num_threads(2)
     yield
     torch.set_num_threads(before)
-
-
-class ColorEncoder:
-    """Embeds the mean color; counts its calls."""
-
-    name, image_size, dim, patches = "color", 8, 4, 2
-    device = torch.device("cpu")
-
-    def __init__(self, content_hash="color", fail_after=None):
-        self.content_hash = content_hash
-        self.crops, self.texts, self.fail_after = 0, 0, fail_after
-        self._lock = threading.Lock()
-
-    def encode_images(self, images):
-        with self._lock:
-            self.crops += len(images)
-            if self.fail_after is not None and self.crops > self.fail_after:
-                raise RuntimeError("stopped in the middle")
-        mean = images.mean((-2, -1))
-        return F.normalize(torch.cat([mean, torch.ones(len(mean), 1)], 1), dim=-1)
-
-    def encode_patches(self, images):
-        """Quarters of the crops, by their mean colors."""
-        quarters = F.adaptive_avg_pool2d(images, 2).permute(0, 2, 3, 1)
-        ones = torch.ones(*quarters.shape[:3], 1)
-        return self.encode_images(images), F.normalize(torch.cat([quarters, ones], -1), dim=-1)
-
-    def encode_text(self, prompts):
-        self.texts += len(prompts)
-        codes = torch.tensor([[float(ord(c)) for c in prompt.ljust(4)[:4]] for prompt in prompts])
-        return F.normalize(codes, dim=-1)
-
-
-class GridEncoder:
-    """Dense features: the image itself, a cell for each block of ``stride`` pixels."""
-
-    name, content_hash, dim = "grid", "grid", 4
-    device = torch.device("cpu")
-
-    def __init__(self):
-        self.images = 0
-
-    def encode_dense(self, image, *, short_side=224, stride=None, facet="key", layer=None, max_tokens=4096):
-        self.images += 1
-        blocks = F.avg_pool2d(image, stride).permute(1, 2, 0)
-        return F.normalize(torch.cat([blocks, torch.ones(*blocks.shape[:2], 1)], -1), dim=-1)
 
 
 CONFIG = FeatureConfig(
@@ -399,212 +346,6 @@ def test_resizing_a_grid_keeps_cell_centers():
 def test_bad_settings_are_refused_at_once(bad):
     with pytest.raises(ValueError):
         FeatureConfig(**bad)
-
-
-# -- external features
-
-
-def _external(capture, folder, write):
-    for view in capture.views.values():
-        path = folder / view.stem
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(path)
-    return folder
-
-
-def test_external_arrays_are_read_by_stem_and_normalized(capture, tmp_path):
-    array = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float16)
-    folder = _external(capture, tmp_path / "npy", lambda path: np.save(f"{path}.npy", array))
-    maps = load_external_features(folder, capture)
-    assert list(maps) == list(capture.views)
-    expected = array.astype(np.float32)
-    expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
-    np.testing.assert_allclose(maps["left/2.png"].clip.numpy(), expected, atol=1e-6)
-    tensors = {"clip": torch.from_numpy(array), "dino": torch.ones(5, 7, 2)}
-    folder = _external(capture, tmp_path / "st", lambda path: save_file(tensors, f"{path}.safetensors"))
-    found = load_external_features(folder, capture)["left/2.png"]
-    np.testing.assert_allclose(found.clip.numpy(), expected, atol=1e-6)
-    torch.testing.assert_close(found.dino, torch.full((5, 7, 2), 0.5**0.5))
-
-
-def test_segment_features_become_maps_and_levels_are_averaged(capture, tmp_path):
-    features = np.array([[2.0, 0], [0, 3.0]], np.float32)
-    segments = np.array([[[0, 1], [-1, 0]], [[1, 1], [-1, -1]]], np.float32)
-
-    def write(path):
-        np.save(f"{path}_f.npy", features)
-        np.save(f"{path}_s.npy", segments)
-
-    found = load_external_features(_external(capture, tmp_path / "fs", write), capture)["left/0.png"]
-    half = 0.5**0.5
-    expected = torch.tensor([[[half, half], [0, 1]], [[0, 0], [1, 0]]])  # no segment: zero
-    torch.testing.assert_close(found.clip, expected)
-
-
-@pytest.mark.parametrize(
-    ("array", "message"),
-    [
-        (np.zeros((4, 4)), r"expected features \[h, w, D\]"),
-        (np.full((2, 2, 3), np.nan), "NaN"),
-        (np.zeros((2, 2, 3), "U1"), "array of numbers"),
-        (np.array([[["a", {}]]], dtype=object), "without pickled objects"),
-    ],
-)
-def test_invalid_external_arrays_are_refused(array, message, capture, tmp_path):
-    folder = _external(
-        capture, tmp_path / "bad", lambda path: np.save(f"{path}.npy", array, allow_pickle=True)
-    )
-    with pytest.raises(FileFormatError, match=message):
-        load_external_features(folder, capture)["left/0.png"]
-
-
-def test_missing_and_mismatched_external_arrays_are_refused(capture, tmp_path):
-    with pytest.raises(FileFormatError, match="no folder"):
-        load_external_features(tmp_path / "nowhere", capture)
-    folder = _external(
-        capture, tmp_path / "x", lambda path: np.save(f"{path}.npy", np.ones((2, 2, 3), np.float32))
-    )
-    np.save(folder / "left/1.npy", np.ones((2, 2, 5), np.float32))
-    maps = load_external_features(folder, capture)
-    _ = maps["left/0.png"]
-    with pytest.raises(FileFormatError, match="depth"):
-        maps["left/1.png"]
-    (folder / "left/1.npy").unlink()
-    with pytest.raises(FileFormatError, match=r"left/1\.npy"):
-        load_external_features(folder, capture)
-    (folder / "left/1.npy").write_bytes(b"\x93NUMPY")
-    with pytest.raises(FileFormatError, match="npy array"):
-        load_external_features(folder, capture)["left/1.png"]
-    np.save(folder / "left/0_s.npy", np.full((2, 2), 4))
-    np.save(folder / "left/0_f.npy", np.ones((4, 3)))
-    (folder / "left/0.npy").unlink()
-    with pytest.raises(FileFormatError, match="integers from -1 to 3"):
-        load_external_features(folder, capture)["left/0.png"]
-
-
-# -- texts
-
-
-def test_a_prompt_is_encoded_once_and_cached_on_disk(tmp_path):
-    encoder = ColorEncoder()
-    cache = TextCache(tmp_path)
-    prompts = ["red apple", 'äpfel\n"quoted"', "red apple", "__metadata__"]
-    found = cache.encode("color", prompts, lambda: encoder)
-    assert encoder.texts == 3
-    torch.testing.assert_close(found, ColorEncoder().encode_text(prompts))
-
-    def never():
-        raise AssertionError("the encoder is not needed")
-
-    torch.testing.assert_close(TextCache(tmp_path).encode("color", prompts, never), found)
-    more = TextCache(tmp_path).encode("color", ["new", "red apple"], lambda: encoder)
-    assert encoder.texts == 4
-    torch.testing.assert_close(more[1], found[0])
-    torch.testing.assert_close(TextCache(tmp_path).encode("color", prompts, never), found)
-
-
-def test_the_file_of_a_scene_does_not_depend_on_what_the_users_cache_knew(tmp_path):
-    TextCache(tmp_path / "user").encode("color", ["blue vase"], ColorEncoder)
-    for scene, user in (("a", "user"), ("b", "empty")):
-        cache = TextCache(tmp_path / scene, tmp_path / user)
-        cache.encode("color", ["red apple", "blue vase", "green box"], ColorEncoder)
-    one, other = (next((tmp_path / scene).iterdir()).read_bytes() for scene in "ab")
-    assert one == other
-
-
-def test_texts_are_encoded_one_by_one_and_the_cache_is_written_once(tmp_path, monkeypatch):
-    """In a batch, the last bits of an embedding depend on the other texts."""
-    batches, written = [], []
-
-    class Watched(ColorEncoder):
-        def encode_text(self, prompts):
-            batches.append(list(prompts))
-            return super().encode_text(prompts)
-
-    from lexsplat.features import text
-
-    def write(path, tensors, metadata):
-        written.append(len(tensors["embeddings"]))
-
-    monkeypatch.setattr(text, "write_tensors", write)
-    TextCache(tmp_path).encode("color", ["apple", "pear", "apple"], Watched)
-    assert batches == [["apple"], ["pear"]]
-    assert written == [2]
-
-
-def test_a_cache_that_cannot_be_written_is_reported_and_the_embedding_returned(tmp_path, caplog):
-    in_the_way = tmp_path / "texts"
-    in_the_way.write_text("no folder")
-    found = TextCache(in_the_way).encode("color", ["apple"], ColorEncoder)
-    assert found.shape == (1, 4)
-    assert "not cached" in caplog.text
-
-
-def test_a_truncated_prompt_is_reported(caplog):
-    from lexsplat.features.encoders import load_clip
-
-    clip = load_clip("bundled")
-    clip.encode_text(["something that one could drink from"])
-    assert not caplog.records
-    clip.encode_text(["a very " * 200 + "red apple"])
-    assert "prompt truncated: 804 tokens, the model's limit is 24" in caplog.text
-
-
-def test_text_of_another_model_is_never_used(tmp_path):
-    TextCache(tmp_path).encode("color", ["apple"], ColorEncoder)
-    other = ColorEncoder("other")
-    TextCache(tmp_path).encode("other", ["apple"], lambda: other)
-    assert other.texts == 1
-    with pytest.raises(ValueError, match="not the model"):
-        TextCache(tmp_path).encode("third", ["apple"], ColorEncoder)
-
-
-def test_words_are_shared_by_folders_and_a_read_only_one_is_never_written(tmp_path, monkeypatch):
-    def never():
-        raise AssertionError("the encoder is not needed")
-
-    shipped, user, scene = tmp_path / "shipped", tmp_path / "user", tmp_path / "scene"
-    TextCache(shipped).encode("color", ["red apple"], ColorEncoder)
-    before = {path: path.read_bytes() for path in shipped.iterdir()}
-    first = TextCache(user, read_only=shipped).encode("color", ["red apple", "pear"], ColorEncoder)
-    assert {path: path.read_bytes() for path in shipped.iterdir()} == before
-    again = TextCache(user).encode("color", ["red apple", "pear"], never)
-    assert torch.equal(first, again)
-    # Another scene of the same encoder needs none either, and carries what it was asked.
-    TextCache(scene, user).encode("color", ["pear"], never)
-    TextCache(scene).encode("color", ["pear"], never)
-    with pytest.raises(AssertionError, match="not needed"):
-        TextCache(scene).encode("color", ["red apple"], never)
-
-
-def test_a_text_cache_is_bounded_and_forgets_what_came_first(tmp_path, monkeypatch):
-    monkeypatch.setattr("lexsplat.features.text._MAX_STORED", 3)
-    for word in ("a", "b", "c", "d", "x" * 2000):
-        TextCache(tmp_path).encode("color", [word], ColorEncoder)
-    counter = ColorEncoder()
-    TextCache(tmp_path).encode("color", ["b", "c", "d"], lambda: counter)
-    assert counter.texts == 0
-    TextCache(tmp_path).encode("color", ["a"], lambda: counter)
-    assert counter.texts == 1
-
-
-def test_vectors_of_another_size_in_a_cache_are_not_mixed_with_the_models(tmp_path):
-    write_tensors(
-        tmp_path / "text-color.safetensors", {"embeddings": torch.ones(1, 9)}, {"texts": '["pear"]'}
-    )
-    found = TextCache(tmp_path).encode("color", ["apple", "pear"], ColorEncoder)
-    torch.testing.assert_close(found, ColorEncoder().encode_text(["apple", "pear"]))
-    torch.testing.assert_close(TextCache(tmp_path).encode("color", ["pear"], ColorEncoder), found[1:])
-
-
-def test_a_damaged_text_cache_is_replaced_and_empty_prompts_are_refused(tmp_path):
-    TextCache(tmp_path).encode("color", ["apple"], ColorEncoder)
-    (file,) = tmp_path.iterdir()
-    file.write_bytes(b"nonsense")
-    assert TextCache(tmp_path).encode("color", ["apple"], ColorEncoder).shape == (1, 4)
-    for prompts in ([], [" "]):
-        with pytest.raises(ValueError, match="not empty"):
-            TextCache(tmp_path).encode("color", prompts, ColorEncoder)
 
 
 def test_the_sparse_settings_take_a_sixth_of_the_crops():

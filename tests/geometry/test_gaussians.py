@@ -1,5 +1,7 @@
 """Stored and activated parameters of Gaussians, and their initialization from points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -74,7 +76,7 @@ def test_degree_is_read_from_the_number_of_coefficients(degree):
 
 def test_select_keeps_every_tensor_aligned():
     points, colors = some_points(10)
-    gaussians = gaussians_from_points(points, colors, antialiased=True)
+    gaussians = replace(gaussians_from_points(points, colors), antialiased=True)
     index = torch.tensor([7, 2, 2])
     chosen = gaussians.select(index)
     assert chosen.antialiased

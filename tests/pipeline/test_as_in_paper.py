@@ -24,7 +24,7 @@ def test_a_build_as_in_the_paper_trains_jointly_and_is_asked_with_a_fixed_thresh
 ):
     color_encoder.install(monkeypatch)
     folder = build(tiny_capture, tmp_path / "scene", PAPER)
-    assert folder.record["stages"]["language"]["joint"]
+    assert folder.record["stages"]["reconstruct"]["joint"]
     config = folder.record["config"]
     assert (config["method"], config["features"]["mode"]) == ("trained", "random")
     assert not folder.read_gaussians().antialiased

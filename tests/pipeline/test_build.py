@@ -11,10 +11,11 @@ import pytest
 from support import color_encoder
 from support.experiments import CONFIG
 
-from lexsplat.language.methods import METHODS, MethodName
+from lexsplat.language.methods import JOINT_METHODS, METHODS, MethodName
 from lexsplat.language.methods.averaged import Averaged, AveragedConfig
 from lexsplat.language.methods.trained import Trained, TrainedConfig
 from lexsplat.pipeline import build as pipeline
+from lexsplat.pipeline import geometry
 from lexsplat.pipeline.build import STAGES, build
 from lexsplat.runtime.memory import parse_bytes
 from lexsplat.scenes.folder import SceneFolder
@@ -57,9 +58,10 @@ def test_every_method_has_a_name_that_settings_accept_and_stages_that_exist():
     from typing import get_args
 
     assert set(get_args(MethodName)) == set(METHODS)
-    for name, method in METHODS.items():
+    for name, method in (*METHODS.items(), *JOINT_METHODS.items()):
         assert method.name == name
         assert set(method.needs) <= set(STAGES)
+        assert set(method.stages) == {"reconstruct", *method.needs, "language"}
         assert method.variants["full"] == {}
         for part in (*method.settings, *(part for changes in method.variants.values() for part in changes)):
             assert hasattr(CONFIG, part), part
@@ -123,8 +125,11 @@ def test_joint_training_makes_features_and_codes_before_the_geometry(tiny_captur
     joint = replace(TRAINED, joint=True)
     finished = stages_run(tiny_capture, tmp_path / "scene", joint)
     assert list(finished) == ["features", "codebook", "reconstruct", "language"]
-    record = SceneFolder.open(tmp_path / "scene").record["stages"]["language"]
-    assert (record["method"], record["joint"]) == ("trained", True)
+    record = SceneFolder.open(tmp_path / "scene").record["stages"]
+    assert (record["language"]["method"], record["reconstruct"]["joint"]) == ("trained", True)
+    assert stages_run(tiny_capture, tmp_path / "scene", joint) == dict.fromkeys(finished, True)
+    changed = replace(joint, trained=replace(CONFIG.trained, iterations=3))
+    assert not stages_run(tiny_capture, tmp_path / "scene", changed)["reconstruct"]
     with pytest.raises(ValueError, match="leave --splats out"):
         build(tiny_capture, tmp_path / "other", joint, splats=tmp_path / "any.ply")
 
@@ -194,14 +199,14 @@ def test_the_encoder_of_photos_is_freed_before_the_language_is_made(tiny_capture
 @pytest.mark.slow
 def test_every_stage_receives_the_memory_budget(tiny_capture, tmp_path, monkeypatch):
     granted = {}
-    for name in ("reconstruct", "fit_codebook"):
-        original = getattr(pipeline, name)
+    for module, name in ((geometry, "reconstruct"), (pipeline, "fit_codebook")):
+        original = getattr(module, name)
 
         def receive(*args, name=name, original=original, **options):
             granted[name] = options["memory"]
             return original(*args, **options)
 
-        monkeypatch.setattr(pipeline, name, receive)
+        monkeypatch.setattr(module, name, receive)
     for method in (Averaged, Trained):
 
         def fit(self, gaussians, views, config, run, *, original=method.fit):

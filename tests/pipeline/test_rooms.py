@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support.splats import solid
+from support.splats import joined, solid
 
 from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
 from lexsplat.geometry.rotations import rotation_about
@@ -194,9 +194,7 @@ def test_a_room_full_of_large_floaters_is_a_room(share):
     floaters = gaussians_from_points(points, np.ones((count, 3)), sh_degree=0, opacity=0.6)
     sizes = torch.from_numpy(np.log(generator.uniform(0.1, 0.5, (count, 1)))).float()
     floaters.log_scales[:] = sizes
-    parts = (room, floaters)
-    both = Gaussians(**{name: torch.cat([part.tensors()[name] for part in parts]) for name in room.tensors()})
-    found = examined(both)
+    found = examined(joined(room, floaters))
     assert found.is_room
     assert found.hazy > 0
 
@@ -287,10 +285,7 @@ def test_floaters_that_hide_most_of_a_scene_are_a_warning(caplog, monkeypatch):
         opacity=0.6,
     )
     fog.log_scales[:] = np.log(0.25)
-    both = Gaussians(
-        **{name: torch.cat([part.tensors()[name] for part in (table, fog)]) for name in table.tensors()}
-    )
-    for scene, warned in ((table, False), (both, True)):
+    for scene, warned in ((table, False), (joined(table, fog), True)):
         caplog.clear()
         with caplog.at_level(logging.WARNING, "lexsplat"):
             choose_views(scene, up=UP)

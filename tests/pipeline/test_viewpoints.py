@@ -5,12 +5,12 @@ from __future__ import annotations
 import functools
 import logging
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from support.splats import solid
+from support.splats import joined, solid
+from support.surfaces import furnished, on_sphere, on_table, sides_of_box
 
 from lexsplat.captures import load_capture
 from lexsplat.geometry.cameras import look_at
@@ -19,9 +19,9 @@ from lexsplat.geometry.rotations import rotation_about
 from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.inputs import reload_capture
-from lexsplat.pipeline.viewpoints import candidates, choosing, stage
+from lexsplat.pipeline.viewpoints import candidates, choosing
 from lexsplat.pipeline.viewpoints.choosing import choose_views
-from lexsplat.pipeline.viewpoints.floaters import find_floaters, isolation
+from lexsplat.pipeline.viewpoints.floaters import find_floaters
 from lexsplat.pipeline.viewpoints.looking import look, surface_share
 from lexsplat.pipeline.viewpoints.writing import write_chosen_capture
 from lexsplat.runtime.errors import CaptureError
@@ -36,21 +36,6 @@ def _few_candidates(monkeypatch) -> None:
     """Choices of a test take seconds."""
     monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 60)
     monkeypatch.setattr(candidates, "_MOST_PLACES", 20)
-
-
-def on_sphere(center, radius: float, count: int, seed: int) -> np.ndarray:
-    directions = np.random.default_rng(seed).normal(size=(count, 3))
-    return np.asarray(center) + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def on_table(seed: int = 0) -> np.ndarray:
-    """Three balls on a square table top at z = 0."""
-    floor = np.random.default_rng(seed).uniform(-1, 1, (4000, 3)) * [1.5, 1.5, 0.002]
-    balls = [
-        on_sphere((x, y, r), r, 1200, seed + 1)
-        for x, y, r in ((0, 0, 0.4), (0.8, 0.3, 0.3), (-0.7, 0.5, 0.35))
-    ]
-    return np.concatenate([floor, *balls])
 
 
 def in_room(seed: int = 0) -> np.ndarray:
@@ -86,31 +71,6 @@ def test_the_up_direction_turns_with_the_scene():
     turn = rotation_about(np.array([1.0, 0.3, 0.2]), 70)
     chosen = choose_views(solid(on_table() @ turn.T))
     assert chosen.up.direction @ (turn @ UP) > 0.98
-
-
-def sides_of_box(low, high, count: int, seed: int) -> np.ndarray:
-    """Points on the six sides of a box."""
-    generator = np.random.default_rng(seed)
-    sizes = np.subtract(high, low)
-    areas = np.prod(sizes) / sizes
-    axis = generator.choice(3, count, p=areas / areas.sum())
-    points = generator.uniform(0, 1, (count, 3))
-    points[np.arange(count), axis] = generator.integers(0, 2, count)
-    return np.asarray(low) + points * sizes
-
-
-def furnished(dense: float = 1.0) -> np.ndarray:
-    """A closed room of 5 x 4 x 2.5 with a table, a wardrobe, a sofa and a ball on the table."""
-
-    def box(low, high, count: int, seed: int) -> np.ndarray:
-        return sides_of_box(low, high, round(dense * count), seed)
-
-    return np.concatenate([
-        box((0, 0, 0), (5, 4, 2.5), 14000, 0), box((1.5, 1.2, 0.7), (3, 2.2, 0.76), 1500, 1),
-        *(box((x, y, 0), (x + 0.06, y + 0.06, 0.7), 80, 2) for x in (1.5, 2.9) for y in (1.2, 2.1)),
-        box((0, 3.4, 0), (1.8, 4, 1.9), 1800, 3), box((3.6, 0, 0), (5, 0.9, 0.45), 1500, 4),
-        box((3.6, 0, 0.45), (5, 0.25, 0.9), 700, 5), on_sphere((2.2, 1.7, 0.9), 0.13, round(dense * 300), 6),
-    ])  # fmt: skip
 
 
 @pytest.mark.slow
@@ -158,7 +118,7 @@ def test_floaters_in_front_of_a_surface_lower_its_share():
     dust = solid(np.random.default_rng(1).uniform([-0.7, -0.7, 0.5], [0.7, 0.7, 1.9], (150, 3)))
     dust.log_scales[:] = np.log(0.05)
     dust.opacity_logits[:] = 0
-    both = Gaussians(**{n: torch.cat([t, getattr(dust, n)]) for n, t in clean.tensors().items()})
+    both = joined(clean, dust)
     with torch.no_grad():
         before, after = (look(scene, camera)[1] for scene in (clean, both))
     assert before > 0.95
@@ -171,82 +131,6 @@ def test_a_bar_that_is_lowered_admits_hazier_views_but_none_far_below_the_best()
     passed = [choosing._clear_enough(shares, part).sum() for part in (1.0, 0.5, 0.25)]
     assert passed == [5, 7, 9]
     assert not choosing._clear_enough(np.zeros(5, np.float32), 0.25).any()
-
-
-def joined(*parts: Gaussians) -> Gaussians:
-    return Gaussians(
-        **{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()}
-    )
-
-
-def dusty() -> tuple[Gaussians, Gaussians]:
-    """Balls on a table, and small floaters around them of which some are certainly floaters."""
-    clean = solid(on_table())
-    dust = solid(np.random.default_rng(3).uniform([-3, -3, 0.1], [3, 3, 4], (700, 3)))
-    dust.log_scales[:] = clean.log_scales[:700]
-    return clean, dust
-
-
-@functools.cache
-def of_dust() -> np.ndarray:
-    """The floaters that are found in `dusty`."""
-    return find_floaters(joined(*dusty()), Path("dusty.ply"))
-
-
-@pytest.mark.slow
-def test_many_floaters_are_left_out_with_a_warning_and_few_lonely_gaussians_stay(caplog):
-    clean, dust = dusty()
-    distances = np.linalg.norm(dust.means.numpy()[:, None] - on_table()[None, ::10], axis=2).min(1)
-    both = joined(clean, dust)
-    with caplog.at_level(logging.WARNING, "lexsplat"):
-        floating = find_floaters(both, Path("dusty.ply"))
-    assert "dusty.ply" in caplog.text
-    assert "float free of all surfaces" in caplog.text
-    assert (floating >= len(clean)).all()
-    far = len(clean) + np.flatnonzero(distances > 1)
-    assert len(far) > 300
-    assert np.isin(far, floating).mean() > 0.95
-    caplog.clear()
-    for few in (both.select(torch.arange(len(clean) + 100)), clean):
-        assert len(find_floaters(few, Path("dusty.ply"))) == 0
-    assert not caplog.text
-
-
-@pytest.mark.slow
-def test_large_floaters_hang_in_front_of_surfaces_and_large_gaussians_behind_the_scene_stay():
-    """Both are within four of their radii from their neighbors, so distances alone do not tell them apart."""
-    clean, dust = dusty()
-    rng = np.random.default_rng(5)
-    above = solid(rng.uniform([-1, -1, 1.0], [1, 1, 1.4], (12, 3)))
-    around = np.linspace(0, 2 * np.pi, 30, endpoint=False)
-    wall = solid(np.stack([9 * np.cos(around), 9 * np.sin(around), np.full(30, 0.5)], 1))
-    above.log_scales[:], wall.log_scales[:] = np.log(0.25), np.log(1.5)
-    scene = joined(clean, dust, above, wall)
-    first = len(clean) + len(dust)
-    own = isolation(scene)[1]
-    assert (own[first:] < 4).all()
-    floating = find_floaters(scene, Path("dusty.ply"))
-    assert np.isin(np.arange(first, first + 12), floating).mean() > 0.8
-    assert not np.isin(np.arange(first + 12, len(scene)), floating).any()
-    assert (floating >= len(clean)).all()
-
-
-@pytest.mark.slow
-def test_floaters_larger_than_the_things_they_engulf_are_found():
-    """Surfaces lie before, on and behind them. Plates under a fine pattern have near neighbors, too, and stay."""
-    clean, dust = dusty()
-    giants = solid(np.array([[-0.6, -0.6, 1.3], [0.5, -1.0, 0.9], [1.2, -0.5, 0.8], [-0.2, 1.2, 1.1]]))
-    giants.log_scales[:] = torch.log(torch.tensor([[1.2], [0.6], [0.4], [0.9]]))
-    plates = solid(np.array([[-0.8, -0.8, 0.0], [0.9, -0.9, 0.0]]))
-    plates.log_scales[:] = torch.log(torch.tensor([0.4, 0.4, 0.002]))
-    plates.quats[:] = torch.tensor([1.0, 0, 0, 0])
-    scene = joined(clean, plates, dust, giants)
-    own = isolation(scene)[1]
-    assert (own[len(clean) : len(clean) + 2] < 0.8).all()
-    assert (own[-4:] < 2).all()
-    floating = find_floaters(scene, Path("dusty.ply"))
-    assert np.isin(np.arange(len(scene) - 4, len(scene)), floating).all()
-    assert (floating >= len(clean) + 2).all()
 
 
 def with_floaters(clean: Gaussians, low, high, count: int) -> Gaussians:
@@ -356,25 +240,6 @@ def test_a_room_is_looked_at_from_around_and_a_table_from_the_places_on_it_if_a_
     positions = np.stack([camera.position for camera in inside.cameras])
     assert ((positions > table.min(0)) & (positions < table.max(0))).all()
     assert "from inside" in inside.note
-
-
-@pytest.mark.slow
-def test_a_build_leaves_floaters_out_of_the_scene_unless_they_are_kept(tmp_path, monkeypatch):
-    clean, dust = dusty()
-    scene, splats = joined(clean, dust), tmp_path / "dusty.ply"
-    write_ply(scene, splats)
-    monkeypatch.setattr(stage, "choose_views", lambda *_, **__: choosing.ChosenViews((), UP, 0, 0, 0, 0))
-    monkeypatch.setattr(stage, "write_chosen_capture", lambda _, __, poses, *rest: poses.mkdir(parents=True))
-    monkeypatch.setattr(stage, "load_capture", lambda poses, **_: SimpleNamespace(root=poses))
-    for keep, count in ((False, len(scene) - len(of_dust())), (True, len(scene))):
-        folder = SceneFolder(tmp_path / str(keep))
-        folder.root.mkdir()
-        config = BuildConfig(keep_floaters=keep)
-        capture = stage.capture_of_splats(splats, folder, config, "cpu", lambda _: None)
-        assert len(stage.splats_of_capture(splats, capture, folder)) == count
-        assert folder.record["stages"]["views"]["floaters"] == len(scene) - count
-    photos = SimpleNamespace(root=tmp_path / "photos")
-    assert len(stage.splats_of_capture(splats, photos, SceneFolder(tmp_path / "False"))) == len(scene)
 
 
 @pytest.mark.parametrize("count", [0, 1, 60])

@@ -45,3 +45,8 @@ def test_each_package_has_a_folder_of_tests_and_each_folder_is_of_a_package():
     folders = {path.name for path in TESTS.iterdir() if path.is_dir() and any(path.rglob("*.py"))}
     assert folders - OTHERS == PACKAGES - {"demo", "__pycache__"}  # demo is data
     assert not list(TESTS.glob("test_*.py"))
+
+
+def test_no_module_of_the_tests_and_the_tools_has_more_than_450_lines():
+    for path in sorted([*TESTS.rglob("*.py"), *(TESTS.parent / "tools").rglob("*.py")]):
+        assert len(path.read_text(encoding="utf-8").splitlines()) <= 450, path

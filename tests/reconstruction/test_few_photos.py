@@ -6,24 +6,12 @@ import logging
 import numpy as np
 import pytest
 
-from lexsplat.captures import Capture, load_capture
-from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.evaluation.metrics import psnr
 from lexsplat.reconstruction import ReconstructionConfig, few_photos, reconstruct
 from lexsplat.reconstruction.few_photos import points_between
 from lexsplat.rendering import render
 
 SHORT = ReconstructionConfig(iterations=3, sh_degree=1, max_gaussians=3_000)
-
-
-@pytest.fixture(scope="module")
-def capture(tiny_capture) -> Capture:
-    return load_capture(tiny_capture)
-
-
-@pytest.fixture(scope="module")
-def points(capture) -> InitialPoints:
-    return initial_points(capture)
 
 
 @pytest.mark.slow

@@ -9,24 +9,14 @@ import torch
 from PIL import Image
 from support.held_out import held_out_psnr
 
-from lexsplat.captures import Capture, load_capture
-from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
+from lexsplat.captures import load_capture
+from lexsplat.captures.sfm.triangulation import InitialPoints
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor, reconstruct
 from lexsplat.runtime.errors import TrainingError
 
 SHORT = ReconstructionConfig(
     iterations=24, sh_degree=1, max_gaussians=1_300, densify_min_every=5, warm_up=0.2, reset_opacities=True
 )
-
-
-@pytest.fixture(scope="module")
-def capture(tiny_capture) -> Capture:
-    return load_capture(tiny_capture)
-
-
-@pytest.fixture(scope="module")
-def points(capture) -> InitialPoints:
-    return initial_points(capture)
 
 
 @pytest.fixture(scope="module")

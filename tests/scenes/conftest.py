@@ -32,3 +32,38 @@ def published_demo(made_once) -> Path:
         "published_demo",
         lambda target: publish(open_scene("demo"), target, PublishOptions(title="A table top")),
     )
+
+
+@pytest.fixture
+def room_encoders(monkeypatch) -> None:
+    """The encoders of the small scenes of `library_scenes` in place of models."""
+    from support.library_scenes import install
+
+    install(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory) -> Path:
+    """Three scenes and a library of them; read-only."""
+    from support.library_scenes import OTHERS, THINGS, install, write_scene
+
+    from lexsplat.scenes.library import Library
+
+    root = tmp_path_factory.mktemp("rooms")
+    with pytest.MonkeyPatch.context() as patch:
+        install(patch)
+        write_scene(root / "kitchen")
+        write_scene(root / "office", OTHERS)
+        write_scene(root / "lab", (*OTHERS[:3], *THINGS[:2]), encoder="def")
+        library = Library.create(root / "library")
+        for name in ("kitchen", "office", "lab"):
+            library.add(root / name)
+    return root
+
+
+@pytest.fixture
+def rooms_copy(rooms, tmp_path) -> Path:
+    """A copy of scenes and library that may be changed."""
+    from support.library_scenes import copied
+
+    return copied(rooms, tmp_path / "rooms")

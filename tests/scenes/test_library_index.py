@@ -22,16 +22,11 @@ from lexsplat.scenes.library import Library
 from lexsplat.scenes.library.contents import Contents
 from lexsplat.scenes.library.indexed import decidable
 
-pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(autouse=True)
-def _encoders(monkeypatch) -> None:
-    install(monkeypatch)
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("room_encoders")]
 
 
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory) -> Path:
+def segmented_rooms(tmp_path_factory) -> Path:
     """Two scenes of five balls, each of them a segment, and a library of them; read-only."""
     root = tmp_path_factory.mktemp("rooms")
     with pytest.MonkeyPatch.context() as patch:
@@ -44,8 +39,8 @@ def rooms(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def rooms_copy(rooms, tmp_path) -> Path:
-    return copied(rooms, tmp_path / "rooms")
+def segmented_copy(segmented_rooms, tmp_path) -> Path:
+    return copied(segmented_rooms, tmp_path / "rooms")
 
 
 @pytest.mark.parametrize("phrase", ["mug 3", "qzx", "which tyos are here?", "the first mug"])
@@ -94,13 +89,13 @@ def test_presence_is_that_of_the_scene_and_counts_and_places_nearly_always(demo_
 @pytest.mark.parametrize(
     ("word", "ball"), [("apple", 0), ("mug", 1), ("banana", 2), ("vase", 3), ("lamp", 4)]
 )
-def test_a_ball_is_where_it_was_made(rooms, word, ball):
-    (hit,) = closed(Library(rooms / "library")).search(word).hits
+def test_a_ball_is_where_it_was_made(segmented_rooms, word, ball):
+    (hit,) = closed(Library(segmented_rooms / "library")).search(word).hits
     assert (hit.scene, hit.source, hit.present, hit.count) == ("kitchen", "index", "yes", 1)
     (thing,) = hit.answer["instances"]
     np.testing.assert_allclose(thing["center"], CENTERS[ball], atol=0.2 * RADIUS)
     np.testing.assert_allclose(thing["size"], 2 * RADIUS, rtol=0.3)
-    (expected,) = find_phrase(open_scene(rooms / "kitchen"), word)["instances"]
+    (expected,) = find_phrase(open_scene(segmented_rooms / "kitchen"), word)["instances"]
     np.testing.assert_allclose(thing["center"], expected["center"], atol=0.01 * RADIUS)
     np.testing.assert_allclose(thing["size"], expected["size"], rtol=0.01)
     assert thing["gaussians"] == expected["gaussians"]
@@ -116,14 +111,14 @@ def test_things_of_one_name_that_are_apart_are_several(tmp_path):
     np.testing.assert_allclose(found, sorted(CENTERS[:2, 0]), atol=0.2 * RADIUS)
 
 
-def test_a_thing_that_is_in_no_scene_is_in_none_without_opening_one(rooms):
-    found = closed(Library(rooms / "library")).search("piano")
+def test_a_thing_that_is_in_no_scene_is_in_none_without_opening_one(segmented_rooms):
+    found = closed(Library(segmented_rooms / "library")).search("piano")
     assert (found.hits, found.opened) == ((), 0)
 
 
-def test_a_picture_frames_the_thing_without_opening_the_scene(rooms, tmp_path):
-    (hit,) = closed(Library(rooms / "library")).search("mug").hits
-    scene = open_scene(rooms / "kitchen")
+def test_a_picture_frames_the_thing_without_opening_the_scene(segmented_rooms, tmp_path):
+    (hit,) = closed(Library(segmented_rooms / "library")).search("mug").hits
+    scene = open_scene(segmented_rooms / "kitchen")
     camera = scene.camera(hit.answer["best_view"])
     middle = camera.K @ (camera.viewmat[:3, :3] @ CENTERS[1] + camera.viewmat[:3, 3])
     x, y = middle[:2] / middle[2]
@@ -149,10 +144,10 @@ def test_kinds_are_answered_by_the_names_of_objects(demo_library):
 @pytest.mark.parametrize(
     "phrase", ["mug next to the vase", "mug or candle", "largest mug", "two mugs", "mugg"]
 )
-def test_relations_and_corrected_words_are_answered_by_the_scenes(rooms, phrase):
-    library = Library(rooms / "library")
+def test_relations_and_corrected_words_are_answered_by_the_scenes(segmented_rooms, phrase):
+    library = Library(segmented_rooms / "library")
     for name in ("kitchen", "office"):
-        expected = find_phrase(open_scene(rooms / name), phrase)
+        expected = find_phrase(open_scene(segmented_rooms / name), phrase)
         found = {hit.scene: hit for hit in library.search(phrase).hits}
         assert (name in found) == (expected["present"] != "no")
         if name in found:
@@ -160,34 +155,34 @@ def test_relations_and_corrected_words_are_answered_by_the_scenes(rooms, phrase)
             assert found[name].answer == expected
 
 
-def test_to_confirm_is_to_ask_the_scene(rooms):
-    library = lexsplat.open_library(rooms / "library")
+def test_to_confirm_is_to_ask_the_scene(segmented_rooms):
+    library = lexsplat.open_library(segmented_rooms / "library")
     found = library.search("mug", confirm=True)
     assert [hit.source for hit in found.hits] == ["scene"]
     assert found.opened >= 1
-    assert found.hits[0].answer == find_phrase(open_scene(rooms / "kitchen"), "mug")
+    assert found.hits[0].answer == find_phrase(open_scene(segmented_rooms / "kitchen"), "mug")
 
 
-def test_a_rebuilt_scene_is_asked_itself(rooms_copy):
-    write_scene(rooms_copy / "kitchen", THINGS[::-1], build=2, segments=True)
-    (hit,) = Library(rooms_copy / "library").search("mug").hits
+def test_a_rebuilt_scene_is_asked_itself(segmented_copy):
+    write_scene(segmented_copy / "kitchen", THINGS[::-1], build=2, segments=True)
+    (hit,) = Library(segmented_copy / "library").search("mug").hits
     assert (hit.scene, hit.source) == ("kitchen", "scene")
     np.testing.assert_allclose(hit.answer["instances"][0]["center"], CENTERS[3], atol=0.2 * RADIUS)
 
 
-def test_a_vanished_scene_is_reported_and_not_answered_from_memory(rooms_copy):
-    shutil.rmtree(rooms_copy / "kitchen")
-    found = Library(rooms_copy / "library").search("mug")
+def test_a_vanished_scene_is_reported_and_not_answered_from_memory(segmented_copy):
+    shutil.rmtree(segmented_copy / "kitchen")
+    found = Library(segmented_copy / "library").search("mug")
     assert found.hits == ()
     assert "no such folder" in found.skipped["kitchen"]
 
 
-def test_a_scale_that_was_set_after_adding_gives_meters(rooms_copy):
-    library = closed(Library(rooms_copy / "library"))
-    record = read_json(rooms_copy / "kitchen" / "scene.json")
+def test_a_scale_that_was_set_after_adding_gives_meters(segmented_copy):
+    library = closed(Library(segmented_copy / "library"))
+    record = read_json(segmented_copy / "kitchen" / "scene.json")
     (before,) = library.search("mug").hits[0].answer["instances"]
-    world = {**open_scene(rooms_copy / "kitchen").world.to_json(), "meters_per_unit": 0.5, "poses": "x"}
-    write_json(rooms_copy / "kitchen" / "scene.json", {**record, "world": world})
+    world = {**open_scene(segmented_copy / "kitchen").world.to_json(), "meters_per_unit": 0.5, "poses": "x"}
+    write_json(segmented_copy / "kitchen" / "scene.json", {**record, "world": world})
     hit = library.search("mug").hits[0]
     assert hit.to_dict()["meters_per_unit"] == 0.5
     assert hit.answer["instances"][0]["size_meters"] == pytest.approx(
@@ -196,12 +191,12 @@ def test_a_scale_that_was_set_after_adding_gives_meters(rooms_copy):
     assert "m." in repr(hit)
 
 
-def test_entries_of_a_library_without_segments_answer_by_their_scenes(rooms_copy):
-    for path in (rooms_copy / "library" / "scenes").glob("*.json"):
+def test_entries_of_a_library_without_segments_answer_by_their_scenes(segmented_copy):
+    for path in (segmented_copy / "library" / "scenes").glob("*.json"):
         record = read_json(path)
         record.pop("contents"), record.pop("hash")
         write_json(path, record)
-    (hit,) = Library(rooms_copy / "library").search("mug").hits
+    (hit,) = Library(segmented_copy / "library").search("mug").hits
     assert (hit.scene, hit.source) == ("kitchen", "scene")
 
 
@@ -209,8 +204,8 @@ def test_entries_of_a_library_without_segments_answer_by_their_scenes(rooms_copy
 
 
 @pytest.mark.parametrize("harm", ["bit", "cut", "gone", "empty"])
-def test_damaged_objects_are_refused_and_repaired(rooms_copy, harm):
-    (path,) = (rooms_copy / "library" / "scenes").glob("kitchen.*.objects.safetensors")
+def test_damaged_objects_are_refused_and_repaired(segmented_copy, harm):
+    (path,) = (segmented_copy / "library" / "scenes").glob("kitchen.*.objects.safetensors")
     before = path.read_bytes()
     middle = len(before) // 2
     changed = {
@@ -218,7 +213,7 @@ def test_damaged_objects_are_refused_and_repaired(rooms_copy, harm):
         "cut": before[:-9],
     }
     path.write_bytes(changed.get(harm, b"")) if harm != "gone" else path.unlink()
-    library = Library(rooms_copy / "library")
+    library = Library(segmented_copy / "library")
     found = library.search("mug")
     assert found.hits == ()
     assert "--repair" in found.skipped["kitchen"]
@@ -238,8 +233,8 @@ def test_equal_scenes_have_equal_bytes(demo_library):
 # -- what people and programs read
 
 
-def test_an_answer_is_read_by_people_and_by_programs(rooms):
-    found = lexsplat.open_library(rooms / "library").search("mug")
+def test_an_answer_is_read_by_people_and_by_programs(segmented_rooms):
+    found = lexsplat.open_library(segmented_rooms / "library").search("mug")
     said = repr(found)
     assert said.startswith(
         'mug: present: yes, in 1 of 2 scenes (understood as "mug")\n  1. kitchen: present: yes. 1 found'

@@ -13,18 +13,13 @@ from lexsplat.runtime.errors import LibraryError
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.library import Library
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("room_encoders")]
 
 QUESTIONS = ("🍎🦆", "где утка", "why is the sky blue", "bananna", "mug or dog", "unicorn", "red apple")
 
 
-@pytest.fixture(autouse=True)
-def _encoders(monkeypatch) -> None:
-    install(monkeypatch)
-
-
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory) -> Path:
+def two_rooms(tmp_path_factory) -> Path:
     """A kitchen with a mug and a banana, an office with neither, and a library of them; read-only."""
     root = tmp_path_factory.mktemp("rooms")
     with pytest.MonkeyPatch.context() as patch:
@@ -45,8 +40,8 @@ def test_a_library_of_one_scene_reports_of_a_phrase_what_the_scene_reports(demo_
         assert {key: hit[key] for key in told} == {key: expected[key] for key in told}
 
 
-def test_a_word_that_is_corrected_without_success_is_reported_with_what_was_searched(rooms):
-    library = Library(rooms / "library")
+def test_a_word_that_is_corrected_without_success_is_reported_with_what_was_searched(two_rooms):
+    library = Library(two_rooms / "library")
     library.search("bananna")
     assert library.search("bananna").understood == '"banana"'
     missed = library.search("drumset or pinao")  # no scene has either
@@ -65,8 +60,8 @@ def test_an_encoder_without_a_hit_that_does_not_know_a_word_is_reported(tmp_path
     assert found.note == f'nothing fits "🍎🦆"; {unknown}'
 
 
-def test_a_note_that_holds_for_some_scenes_alone_names_them(rooms):
-    found = Library(rooms / "library").search("mug or candle")
+def test_a_note_that_holds_for_some_scenes_alone_names_them(two_rooms):
+    found = Library(two_rooms / "library").search("mug or candle")
     assert [hit.scene for hit in found.hits] == ["kitchen", "office"]
     assert set(found.note.split("; ")) == {
         'nothing fits "candle" (in kitchen)',
@@ -74,8 +69,8 @@ def test_a_note_that_holds_for_some_scenes_alone_names_them(rooms):
     }
 
 
-def test_no_is_said_only_if_all_scenes_were_asked_or_ruled_out(rooms, tmp_path):
-    copy = copied(rooms, tmp_path / "rooms")
+def test_no_is_said_only_if_all_scenes_were_asked_or_ruled_out(two_rooms, tmp_path):
+    copy = copied(two_rooms, tmp_path / "rooms")
     library = Library(copy / "library")
     assert library.search("dog").present == "no"
     assert library.search("mug").present == "yes"
@@ -84,8 +79,8 @@ def test_no_is_said_only_if_all_scenes_were_asked_or_ruled_out(rooms, tmp_path):
     assert (found.present, found.hits, list(found.skipped)) == ("unsure", (), ["kitchen"])
 
 
-def test_people_read_presence_and_what_was_understood(rooms, demo_library, capsys):
-    library = str(rooms / "library")
+def test_people_read_presence_and_what_was_understood(two_rooms, demo_library, capsys):
+    library = str(two_rooms / "library")
     assert cli.main(["library", "search", library, "bananna", "mug", "--thumbnails", "none"]) == 0
     said = capsys.readouterr().out
     assert 'bananna: present: yes, in 1 of 2 scenes (understood as "banana")' in said
@@ -101,8 +96,8 @@ def test_people_read_presence_and_what_was_understood(rooms, demo_library, capsy
 
 
 @pytest.mark.parametrize("gone", ["library", "library/scenes"])
-def test_a_library_that_is_gone_while_it_is_open_is_reported_until_it_is_back(rooms, tmp_path, gone):
-    copy = copied(rooms, tmp_path / "rooms")
+def test_a_library_that_is_gone_while_it_is_open_is_reported_until_it_is_back(two_rooms, tmp_path, gone):
+    copy = copied(two_rooms, tmp_path / "rooms")
     library = Library(copy / "library")
     assert library.search("mug").present == "yes"
     (copy / gone).rename(copy / "elsewhere")

@@ -5,7 +5,6 @@ import json
 import shutil
 import signal
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ pytest.importorskip("httpx2")
 import torch
 from library import mixed_library  # benchmarks/library.py
 from support.chroma import Chroma
-from support.library_scenes import OTHERS, THINGS, install, write_scene
 
 from lexsplat.queries.phrases import Thing
 from lexsplat.queries.vocabulary import default_vocabulary
@@ -24,22 +22,9 @@ from lexsplat.scenes.library import server as served_by
 from lexsplat.scenes.library.entries import Codes
 from lexsplat.scenes.library.searching import candidates
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("room_encoders")]
 
 NAMES = ("kitchen", "office", "lab")
-
-
-@pytest.fixture(autouse=True)
-def _encoders(monkeypatch) -> None:
-    install(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def rooms(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("rooms")
-    for name, things in zip(NAMES, (THINGS, OTHERS, (*OTHERS[:3], *THINGS[:2]))):
-        write_scene(root / name, things, encoder="def" if name == "lab" else "abc")
-    return root
 
 
 @pytest.fixture(scope="module")

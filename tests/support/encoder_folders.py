@@ -6,11 +6,22 @@ import json
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from lexsplat.features.encoders import load_clip
 
 MEAN, STD = [0.1, 0.2, 0.3], [0.5, 0.6, 0.7]
+
+
+def normalized(images: torch.Tensor) -> torch.Tensor:
+    """Pixels as the encoders of this module expect them."""
+    pixels = (images.double().numpy() - np.reshape(MEAN, (3, 1, 1))) / np.reshape(STD, (3, 1, 1))
+    return torch.from_numpy(pixels).float()
+
+
+def unit(features: torch.Tensor) -> torch.Tensor:
+    return features / features.norm(dim=-1, keepdim=True)
 
 
 def seeded(build):

@@ -23,6 +23,7 @@ from lexsplat.language.segments import Segments
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.library import Library
 from lexsplat.scenes.library.library import COMPARED
 from lexsplat.scenes.library.records import read_record, write_record
 from support.language_scene import make_scene
@@ -108,3 +109,11 @@ def install(patch) -> None:
 
     for module in ("lexsplat.scenes.library.library", "lexsplat.scenes.scene"):
         patch.setattr(f"{module}.load_text", load)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
+
+
+def hits(library: Library, phrase: str) -> list[str]:
+    return [hit.scene for hit in library.search(phrase).hits]

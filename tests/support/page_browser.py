@@ -5,11 +5,15 @@ from __future__ import annotations
 import contextlib
 import functools
 import http.server
+import io
 import shutil
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+
+import numpy as np
+from PIL import Image
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
@@ -80,6 +84,12 @@ def ask(page, text: str) -> None:
     page.fill(".search input", text)
     page.keyboard.press("Enter")
     until(page, "Boolean(document.querySelector('.card'))")
+
+
+def picture(page) -> np.ndarray:
+    """The page ``[H, W, 3]`` once the scene is drawn."""
+    page.evaluate("lexsplat.app.stage.settled()")
+    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
 
 def covered_tools(page) -> list[str]:

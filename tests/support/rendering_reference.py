@@ -14,6 +14,8 @@ from torch import Tensor
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
 
+FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
+
 
 def to_float64(gaussians: Gaussians) -> dict[str, Tensor]:
     """Leaves with gradients, by field name."""
@@ -149,3 +151,11 @@ def front_camera(width: int = 50, height: int = 37) -> Camera:
         height,
         0.8,
     )
+
+
+def with_gradients(gaussians: Gaussians) -> Gaussians:
+    return gaussians.map(lambda t: t.clone().requires_grad_())
+
+
+def relative_error(found: Tensor, expected: Tensor) -> float:
+    return float((found.double() - expected).norm() / expected.norm().clamp_min(1e-12))

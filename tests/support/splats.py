@@ -64,3 +64,9 @@ def solid(points: np.ndarray, log_size: float = -0.1) -> Gaussians:
     made = gaussians_from_points(points, colors, sh_degree=0, opacity=0.98)
     made.log_scales += log_size
     return made
+
+
+def joined(*parts: Gaussians) -> Gaussians:
+    return Gaussians(
+        **{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()}
+    )

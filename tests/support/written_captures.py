@@ -15,6 +15,7 @@ from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, look_at
 
 WIDTH, HEIGHT = 64, 48
 FOCAL = 60.0
+NAMES = [f"{index:04d}.png" for index in range(1, 18)]
 
 
 def shared_data(name: str) -> Path:

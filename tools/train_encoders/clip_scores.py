@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from crops import Crop
 from torch import Tensor
-from words import CANONICAL, COLORS, FALSE, NAMES, OPEN, SYNONYMS, TRUE, UNKNOWN_TESTED, Label, Phrase
+from vocabulary import CANONICAL, COLORS, NAMES, SYNONYMS, UNKNOWN_TESTED
+from words import FALSE, OPEN, TRUE, Label, Phrase
 
 _METALS = ("gold", "silver", "copper")
 _MANY_COLORED = ("books", "floor")

@@ -42,7 +42,8 @@ def render(options: argparse.Namespace) -> None:
 
 def train(options: argparse.Namespace) -> None:
     """Train both encoders; the last line of each log in the work folder has the scores."""
-    from train_clip import PHASES, train_clip
+    from clip_settings import PHASES
+    from train_clip import train_clip
     from train_dino import DinoTraining, train_dino
     from workers import run_workers
 
@@ -65,8 +66,9 @@ def train(options: argparse.Namespace) -> None:
 def score(options: argparse.Namespace) -> None:
     """Print the scores of the encoders in the output folder on the held-out frames."""
     from clip_scores import by_pair
+    from clip_settings import ClipTraining
     from crops import Frames
-    from train_clip import ClipTraining, Examination, Trainer
+    from train_clip import Examination, Trainer
     from train_dino import dense_scores
     from transformers import CLIPTokenizer, ViTModel
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shapes import box, draped_sheet, joined
 from surroundings import light_room, make_table
 from things import KINDS, Thing, make
-from words import HELD_OUT_PAIRS
+from vocabulary import HELD_OUT_PAIRS
 
 TOP = (1.75, 1.3)
 """Half extents of the table's free area, scene units."""

@@ -8,16 +8,8 @@ from pathlib import Path
 import numpy as np
 from tokenizers import Regex, Tokenizer, models, normalizers, pre_tokenizers, trainers
 from transformers import CLIPTokenizer
-from words import (
-    CANONICAL,
-    COLORS,
-    NAMES,
-    PARTS,
-    SYNONYMS,
-    UNKNOWN_TRAINED,
-    any_phrase,
-    in_sentence,
-)
+from vocabulary import CANONICAL, COLORS, NAMES, PARTS, SYNONYMS, UNKNOWN_TRAINED
+from words import any_phrase, in_sentence
 
 VOCABULARY = 1400
 LENGTH = 24

@@ -20,11 +20,11 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
+from clip_batches import MEAN, STD, jittered
 from crops import Frame, Frames
 from dense_scores import grouping, mean_colors
 from numpy.typing import NDArray
 from torch import Tensor
-from train_clip import MEAN, STD, jittered
 from transformers import ViTConfig, ViTImageProcessor, ViTModel
 from workers import average_gradients
 

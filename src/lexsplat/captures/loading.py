@@ -87,11 +87,7 @@ def load_capture(
 
 
 def _missing_files(files: CameraFiles) -> list[str]:
-    """A warning that lists the images without a file, if there are any.
-
-    Raises:
-        CaptureError: If no image has a file.
-    """
+    """A warning that lists the images without a file, if there are any."""
     if not files.photos:
         raise CaptureError(
             files.origin,
@@ -109,9 +105,6 @@ def _missing_files(files: CameraFiles) -> list[str]:
 def _check_names(names: list[str], origin: Path) -> None:
     """Refuse duplicate images, and images whose names differ in their suffix only: index maps, masks and heatmaps are
     named after stems.
-
-    Raises:
-        CaptureError: If there are two of one stem.
     """
     stems: dict[str, str] = {}
     for name in names:

@@ -183,8 +183,8 @@ class Language(Build):
     def check(self) -> None:
         """Refuse invalid options."""
         super().check()
-        if self.splats is not None and self.settings.spelled_out().joint:
-            raise ValueError("joint training makes its own Gaussians: give --splats or --joint, not both")
+        if self.splats is not None:
+            self.settings.spelled_out().refuse_beside_splats()
         if self.splats is None and not self.capture:
             raise ValueError("a CAPTURE is needed, or --splats FILE")
         if self.test_views and not self.capture:

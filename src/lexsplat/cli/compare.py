@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from lexsplat.cli.arguments import MEASURED_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.experiments import open_bench, print_table
-from lexsplat.cli.options import (
-    ALL_PROTOCOLS,
-    CaptureArgument,
-    PromptListName,
-    ProtocolName,
-    check_seeds,
-)
+from lexsplat.cli.options import ALL_PROTOCOLS, CaptureArgument, PromptListName, ProtocolName, check_seeds
 from lexsplat.cli.settings import Settings
 from lexsplat.evaluation.compare import COMPARED, ComparisonPlan
 from lexsplat.pipeline.config import BuildConfig

@@ -81,11 +81,7 @@ class Export:
 
 
 def _refuse_existing(file: Path) -> None:
-    """Ask before an existing file is replaced.
-
-    Raises:
-        SceneFolderError: If the file exists and the user does not agree or cannot be asked.
-    """
+    """Ask before an existing file is replaced."""
     if file.exists() and not confirmed(f"{file} exists. Replace it?"):
         raise SceneFolderError(
             file,

@@ -176,6 +176,6 @@ def make_language(
             views, features=features_of_codes(code_maps, codebook) if wrong_labels else bench.maps
         )
     scratch = bench.folder.root / "checkpoints"
-    run = FitRun(seed=config.seed, memory=bench.memory, scratch=scratch, listener=bench.listener)
+    run = FitRun(seed=config.seed, memory=config.memory_bytes, scratch=scratch, listener=bench.listener)
     field = method.fit(bench.gaussians, views, config, run)
     return field, {**seconds, "language": time.perf_counter() - start}

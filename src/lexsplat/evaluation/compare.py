@@ -73,5 +73,5 @@ def _fitted(bench: Bench, baseline: Baseline, prompts: Sequence[str], seed: int)
     cameras = {name: view.camera for name, view in bench.capture.views.items()}
     start = time.perf_counter()
     classes = embed_prompts(prompts, bench.encode_text) if prompts else None
-    run = BaselineRun(cameras, classes, seed, bench.memory, bench.listener)
+    run = BaselineRun(cameras, classes, seed, bench.config.memory_bytes, bench.listener)
     return baseline.fit(data, run), {baseline.name: time.perf_counter() - start}

@@ -57,7 +57,6 @@ from lexsplat.runtime.environment import code_identity, machine_facts
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 from lexsplat.runtime.files import read_json, read_tensors, to_json, write_json, write_tensors
 from lexsplat.runtime.fingerprints import file_hash, fingerprint
-from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.scene import Scene
 
@@ -147,7 +146,6 @@ class Bench:
         self.capture = reload_capture(self.folder)
         sizes = [view.capture_size for view in self.capture.views.values()]
         self.config = config.resolved(self.device, max(sizes, key=lambda size: size[0] * size[1]))
-        self.memory = parse_bytes(config.memory)
         self.ground_truth = read_held_out(self.capture, self.origin)
         self.gaussians = self.folder.read_gaussians().to(self.device)
         self._encoders = Encoders(
@@ -214,7 +212,7 @@ class Bench:
             settings,
             seed=seed,
             device=self.device,
-            memory=self.memory,
+            memory=self.config.memory_bytes,
             listener=self.listener,
         )
         maps = assign_code_maps(self.maps, codebook, names, listener=self.listener)

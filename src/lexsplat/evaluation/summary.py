@@ -9,12 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.evaluation.metrics import (
-    MaskScores,
-    ThresholdCounts,
-    interpolated_precision,
-    mean_over_images,
-)
+from lexsplat.evaluation.metrics import MaskScores, ThresholdCounts, interpolated_precision, mean_over_images
 from lexsplat.evaluation.protocols import accuracy_at
 from lexsplat.evaluation.results import THRESHOLD_KINDS, PairResult, Pairs
 

@@ -18,12 +18,7 @@ from lexsplat.features.clip_image import ClipImages
 from lexsplat.features.clip_text import UNLIKE, UNLIKE_WORDS, ClipText, light_tower
 from lexsplat.features.hub import local_folder
 from lexsplat.features.portable import TextWeights, tokenizer_content
-from lexsplat.features.pretrained import (
-    PretrainedModel,
-    check_images,
-    normalization,
-    resize_images,
-)
+from lexsplat.features.pretrained import PretrainedModel, check_images, normalization, resize_images
 from lexsplat.runtime.errors import ModelError
 
 log = logging.getLogger("lexsplat")

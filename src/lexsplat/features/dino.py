@@ -12,12 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.features.pretrained import (
-    PretrainedModel,
-    check_images,
-    normalization,
-    resize_images,
-)
+from lexsplat.features.pretrained import PretrainedModel, check_images, normalization, resize_images
 
 DEFAULT_DINO = "facebook/dino-vits8"
 """The DINO of the paper's released code."""

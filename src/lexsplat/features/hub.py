@@ -174,22 +174,14 @@ def content_hash(folder: Path, tower: str) -> str:
 
 
 def _check_readable(path: Path, mode: int = os.R_OK) -> None:
-    """Refuse a file or folder without permission.
-
-    Raises:
-        ModelError: If there is none.
-    """
+    """Refuse a file or folder without permission."""
     if not os.access(path, mode):
         remedy = f"allow it: chmod u+r{'x' if mode & os.X_OK else ''} {path}"
         raise ModelError(path, expected="permission to read it", found="none", remedy=remedy)
 
 
 def _check_has_text(folder: Path, name: str) -> None:
-    """Refuse an encoder of photos alone where an image-text model is needed: a tokenizer would not help it.
-
-    Raises:
-        ModelError: If its configuration has no text tower.
-    """
+    """Refuse an encoder of photos alone where an image-text model is needed: a tokenizer would not help it."""
     config = read_config(folder / "config.json")
     if "model_type" in config and not any(key.startswith("text_config") for key in config):
         found = f"a {config['model_type']!r} model without a text tower"

@@ -75,7 +75,6 @@ def grid_levels(
         height: Image height in pixels.
         sizes: Sides as fractions of the image's short side.
         strides: Largest distance between neighbors for each size, as a fraction of the crop's side.
-
     """
     levels = []
     for fraction, stride in zip(sizes, strides):

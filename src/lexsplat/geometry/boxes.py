@@ -54,10 +54,10 @@ class Box(NamedTuple):
         """Volume in cubic world units."""
         return float(np.prod(2 * self.half_sizes))
 
-    def contains(self, points: NDArray, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Which points ``[M, 3]`` are inside, or at most ``margin`` outside along each axis."""
+    def contains(self, points: NDArray) -> NDArray[np.bool_]:
+        """Which points ``[M, 3]`` are inside."""
         local = np.abs((np.asarray(points) - self.center) @ self.axes.T)
-        return np.asarray((local <= self.half_sizes + margin).all(-1))
+        return np.asarray((local <= self.half_sizes).all(-1))
 
 
 @dataclass(frozen=True)

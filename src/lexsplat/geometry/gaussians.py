@@ -132,7 +132,6 @@ def gaussians_from_points(
     *,
     sh_degree: int = 3,
     opacity: float = 0.1,
-    antialiased: bool = False,
     device: torch.device | str = "cpu",
 ) -> Gaussians:
     """One isotropic Gaussian per point; its scale is the mean distance to the three nearest neighbors (3DGS).
@@ -142,7 +141,6 @@ def gaussians_from_points(
         colors: RGB ``[N, 3]`` in 0..1.
         sh_degree: Highest stored degree of spherical harmonics; all coefficients but the constant start at zero.
         opacity: Initial opacity in 0..1.
-        antialiased: See `Gaussians`.
         device: Device of the result.
 
     Raises:
@@ -178,5 +176,4 @@ def gaussians_from_points(
         opacity_logits=torch.full((count,), float(np.log(opacity / (1 - opacity)))),
         sh0=((rgb - 0.5) / SH_C0)[:, None, :],
         shN=torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
-        antialiased=antialiased,
     ).to(device)

@@ -8,24 +8,20 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from lexsplat.captures import Capture, View, load_annotations
-from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook
 from lexsplat.features import FeatureMaps
-from lexsplat.geometry.world import World, parse_vector
 from lexsplat.language.code_maps import MaskedCodeMaps, mark_masked_cells
-from lexsplat.language.methods import METHODS, FitRun, TrainingViews
-from lexsplat.language.methods.joint import JointTrainer
+from lexsplat.language.methods import FitRun, TrainingViews
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.distribution import extract_on_workers
 from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps, fetch_clip
+from lexsplat.pipeline.geometry import GeometryRun, way_to_geometry
 from lexsplat.pipeline.inputs import (
     PhotoSurvey,
     check_given_maps,
@@ -34,19 +30,15 @@ from lexsplat.pipeline.inputs import (
     survey_photos,
 )
 from lexsplat.pipeline.provenance import features_identity, model_place, with_full_paths, write_provenance
-from lexsplat.pipeline.splats import check_agreement, existing_splats, splats_hash
-from lexsplat.pipeline.viewpoints import capture_of_splats, splats_of_capture
+from lexsplat.pipeline.splats import existing_splats
+from lexsplat.pipeline.viewpoints import capture_of_splats
 from lexsplat.pipeline.viewpoints.choosing import SIZE
-from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
-from lexsplat.reconstruction.block_training import BlockRun, reconstruct_blocks
-from lexsplat.reconstruction.blocks import number_of_blocks
 from lexsplat.rendering.backends import require_gsplat
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import choose_device, choose_encoder_device
 from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetError, ModelError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.training import Checkpoint
 from lexsplat.runtime.workers import IN_PROCESS, SharedFolder, Workers, open_workers
@@ -56,7 +48,7 @@ from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.previous import drop_previous
 
 STAGES = ("reconstruct", "features", "codebook", "language")
-"""Names of all stages. A method may not need the codebook, and joint training reconstructs after it."""
+"""Names of all stages; the method has those of a build and their order (`LanguageMethod.stages`)."""
 
 
 def build(
@@ -84,8 +76,8 @@ def build(
     Raises:
         LexsplatError: If anything in the capture, the models or the output folder is wrong, or the device cannot be
             used.
-        ValueError: If ``until`` is not a stage, ``splats`` are given for joint training, or there is neither a source
-            nor ``splats``.
+        ValueError: If ``until`` is not a stage, ``splats`` are given where the settings make their own Gaussians, or
+            there is neither a source nor ``splats``.
     """
     source, config = None if source is None else Path(source), (config or BuildConfig()).spelled_out()
     _check_request(source, splats, until, config)
@@ -123,7 +115,7 @@ def build(
             sizes = [view.capture_size for view in capture.views.values()]
             config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
             capture = capture.downscaled(config.downscale or 1.0)
-            _check_photos(capture, parse_bytes(config.memory))
+            _check_photos(capture, config.memory_bytes)
             check_given_maps(config, capture)
             builder = _Builder(capture, folder, config, device, listener, splats)
             builder.encoders, builder.workers = checked, workers
@@ -142,9 +134,8 @@ def _check_request(source: Path | None, splats: Path | None, until: str, config:
         raise ValueError(f"until must be one of {', '.join(STAGES)}, got {until!r}")
     if source is None and splats is None:
         raise ValueError("a build needs a capture or splats")
-    if config.joint and splats is not None:
-        raise ValueError("joint training makes its own Gaussians: leave --splats out")
     if splats is not None:
+        config.refuse_beside_splats()
         existing_splats(splats)
         if source is not None:
             refuse_without_cameras(source)
@@ -178,12 +169,11 @@ class _Builder:
         splats: Path | None = None,
     ) -> None:
         self.capture, self.folder, self.config = capture, folder, config
-        self.device, self.listener, self.splats = device, listener, splats
+        self.device, self.listener = device, listener
         self.workers: Workers = IN_PROCESS
         self.encoders: Encoders | None = None
-        self.method = METHODS[config.method]
-        self.memory = parse_bytes(config.memory)
-        self.blocks = number_of_blocks(config.blocks, config.reconstruction, device, self.memory)
+        self.method = config.language_method
+        self.geometry = way_to_geometry(config, device, splats)
         self.fingerprints: dict[str, str] = {}
         self.checkpoint: Checkpoint | None = None
         self._maps: FeatureMaps | None = None
@@ -215,33 +205,17 @@ class _Builder:
         features = [capture_hash, *features_identity(config, self.capture)]
         own_features = [] if config.features_from is not None else [folder.features_path]
         language = ["reconstruct", self.method.needs[-1], method_settings, config.seed]
+        geometry = [capture_hash, *self.geometry.inputs(config, self.device)]
+        own_geometry = [folder.gaussians_path, *self.geometry.outputs(self._checkpoints)]
         stages = {
-            "reconstruct": self._geometry(capture_hash, config),
+            "reconstruct": _Stage(geometry, self._make_geometry, own_geometry),
             "features": _Stage(features, self._extract_features, own_features),
             "codebook": _Stage(
                 ["features", config.codebook, config.seed], self._fit_codebook, self._code_paths()
             ),
             "language": _Stage(language, self._fit_language, [folder.language_path]),
         }
-        order = ("reconstruct", *self.method.needs, "language")
-        if config.joint:  # language is trained with the geometry, so its inputs come first
-            geometry = [*stages["reconstruct"].inputs, "codebook", config.trained]
-            outputs = [folder.gaussians_path, self._joint_path]
-            stages["reconstruct"] = _Stage(geometry, self._train_jointly, outputs)
-            stages["language"] = _Stage(
-                ["reconstruct", method_settings], self._take_joint_language, [folder.language_path]
-            )
-            order = (*self.method.needs, "reconstruct", "language")
-        return {name: stages[name] for name in order}
-
-    def _geometry(self, capture_hash: str, config: BuildConfig) -> _Stage:
-        outputs = [self.folder.gaussians_path]
-        if self.splats is not None:
-            return _Stage([capture_hash, splats_hash(self.splats)], self._take_splats, outputs)
-        inputs = [capture_hash, config.reconstruction, config.seed, self.device]
-        if self.blocks > 1:
-            inputs += [f"{self.blocks} blocks", self.config.up]
-        return _Stage(inputs, self._reconstruct, outputs)
+        return {name: stages[name] for name in self.method.stages}
 
     def _fingerprint(self, stage: _Stage) -> str:
         return fingerprint([
@@ -274,58 +248,18 @@ class _Builder:
 
     # -- the work of each stage
 
-    def _reconstruct(self) -> dict[str, Any]:
-        if self.blocks > 1:
-            return self._reconstruct_blocks()
-        gaussians = reconstruct(
+    def _make_geometry(self) -> dict[str, Any]:
+        run = GeometryRun(
             self.capture,
-            self.config.reconstruction,
-            device=self.device,
-            seed=self.config.seed,
-            cache_dir=self._checkpoints / "points",
-            memory=self.memory,
-            checkpoint=self.checkpoint,
-            listener=self.listener,
+            self.folder,
+            self.device,
+            fit=self._fit_run(),
+            key=self.fingerprints["reconstruct"],
+            codes=self._views_with_codes,
         )
+        gaussians, facts = self.geometry.make(self.config, run)
         self.folder.write_gaussians(gaussians)
-        return {"gaussians": len(gaussians)}
-
-    def _reconstruct_blocks(self) -> dict[str, Any]:
-        config, folder = self.config, self._checkpoints / "blocks"
-        points = self._initial_points()
-        key = self.fingerprints["reconstruct"]
-        run = BlockRun(self.device, config.seed, self.memory, folder, key, self.workers, self.listener)
-        world = World.of_cameras(view.camera for view in self.capture.train_views)
-        if config.up is not None:
-            world = world.with_up(parse_vector(config.up))
-        gaussians = reconstruct_blocks(
-            self.capture, config.reconstruction, points, world.up, self.blocks, run
-        )
-        self.folder.write_gaussians(gaussians)
-        return {"gaussians": len(gaussians), "blocks": self.blocks}
-
-    def _take_splats(self) -> dict[str, Any]:
-        splats = existing_splats(self.splats)
-        gaussians = splats_of_capture(splats, self.capture, self.folder)
-        check_agreement(gaussians, list(self._training_views.values()), splats)
-        self.folder.write_gaussians(gaussians)
-        return {"gaussians": len(gaussians), "splats": str(splats.resolve())}
-
-    def _train_jointly(self) -> dict[str, Any]:
-        config, seed, memory = self.config, self.config.seed, self.memory
-        points = self._initial_points()
-        check_gaussians(config.reconstruction, self.device, memory)
-        reconstructor = Reconstructor(
-            self.capture, config.reconstruction, points, device=self.device, seed=seed, memory=memory
-        )
-        views = self._views_with_codes()
-        code_maps, codebook = views.require_codes()
-        trainer = JointTrainer(reconstructor, views.cameras, code_maps, codebook, config.trained, seed=seed)
-        trainer.run(self.listener, self.checkpoint)
-        gaussians, field = trainer.result()
-        self.folder.write_gaussians(gaussians)
-        write_tensors(self._joint_path, field.tensors(), field.metadata())
-        return {"gaussians": len(gaussians)}
+        return {"gaussians": len(gaussians), **facts}
 
     def _extract_features(self) -> dict[str, Any]:
         maps = self._feature_maps()
@@ -337,9 +271,9 @@ class _Builder:
 
     def _fit_codebook(self) -> dict[str, Any]:
         maps, names = self._feature_maps(), self.capture.train_names
-        seed, memory, listener = self.config.seed, self.memory, self.listener
+        seed, memory = self.config.seed, self.config.memory_bytes
         codebook = fit_codebook(
-            maps, names, self.config.codebook, seed=seed, memory=memory, listener=listener
+            maps, names, self.config.codebook, seed=seed, memory=memory, listener=self.listener
         )
         code_maps = assign_code_maps(maps, codebook, names, listener=self.listener)
         for name, code_map in code_maps.items():
@@ -354,30 +288,25 @@ class _Builder:
             views = self._views_with_codes()
         else:
             views = TrainingViews(self._training_views, features=self._feature_maps())
-        run = FitRun(
-            seed=self.config.seed,
-            memory=self.memory,
-            scratch=self._checkpoints,
-            workers=self.workers,
-            checkpoint=self.checkpoint,
-            listener=self.listener,
-        )
-        field = self.method.fit(gaussians, views, self.config, run)
-        self._write_language(field.tensors(), field.metadata())
+        field = self.method.fit(gaussians, views, self.config, self._fit_run())
+        metadata = {**field.metadata(), "reconstruction": self.fingerprints["reconstruct"]}
+        write_tensors(self.folder.language_path, field.tensors(), metadata)
         facts: dict[str, Any] = {"method": field.method, **field.facts()}
         if field.segments is not None:
             facts["segments"] = field.segments.levels.shape[1]
         return facts
 
-    def _take_joint_language(self) -> dict[str, Any]:
-        self._write_language(*read_tensors(self._joint_path))
-        return {"method": self.method.name, "joint": True}
-
     # -- what the stages share
 
-    def _write_language(self, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-        metadata = {**metadata, "reconstruction": self.fingerprints["reconstruct"]}
-        write_tensors(self.folder.language_path, dict(tensors), metadata)
+    def _fit_run(self) -> FitRun:
+        return FitRun(
+            seed=self.config.seed,
+            memory=self.config.memory_bytes,
+            scratch=self._checkpoints,
+            workers=self.workers,
+            checkpoint=self.checkpoint,
+            listener=self.listener,
+        )
 
     def _feature_maps(self) -> FeatureMaps:
         """Features of the training views. What encodes photos is freed when all features are stored."""
@@ -393,12 +322,6 @@ class _Builder:
             encoders.keep_text(self.device)
         return self._maps
 
-    def _initial_points(self) -> InitialPoints:
-        cache, seed = self._checkpoints / "points", self.config.seed
-        return initial_points(
-            self.capture, seed=seed, cache_dir=cache, memory=self.memory, listener=self.listener
-        )
-
     @property
     def _training_views(self) -> dict[str, View]:
         return {name: self.capture.views[name] for name in self.capture.train_names}
@@ -412,10 +335,6 @@ class _Builder:
     @property
     def _checkpoints(self) -> Path:
         return self.folder.root / "checkpoints"
-
-    @property
-    def _joint_path(self) -> Path:
-        return self._checkpoints / "joint_language.safetensors"
 
     def _code_paths(self) -> list[Path]:
         names = self.capture.train_names

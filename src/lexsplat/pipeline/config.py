@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +16,7 @@ from lexsplat.features.clip import patch_grid
 from lexsplat.features.encoders import DEFAULT_CLIP, DEFAULT_DINO
 from lexsplat.features.hub import present_name
 from lexsplat.geometry.world import World, parse_vector
-from lexsplat.language.methods import METHODS, MethodName
+from lexsplat.language.methods import JOINT_METHODS, METHODS, LanguageMethod, MethodName
 from lexsplat.language.methods.averaged import AveragedConfig
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.reconstruction import ReconstructionConfig
@@ -124,9 +125,8 @@ class BuildConfig:
             raise ValueError(f"views_from must be auto, inside or around, got {self.views_from!r}")
         if self.encoder_device not in ("auto", "cpu", "cuda", "mps"):
             raise ValueError(f"encoder_device must be auto, cpu, cuda or mps, got {self.encoder_device!r}")
-        parse_bytes(self.memory)
         check_spec(self.workers)
-        number_of_blocks(self.blocks, self.reconstruction, "cpu", parse_bytes(self.memory))
+        number_of_blocks(self.blocks, self.reconstruction, "cpu", self.memory_bytes)
         if self.joint and self.blocks != "none":
             raise ValueError("joint training takes the capture in one piece: leave --blocks out")
         check_seed(self.seed)
@@ -134,9 +134,8 @@ class BuildConfig:
             raise ValueError(f"downscale must be positive, got {self.downscale:g}")
         if self.method not in METHODS:
             raise ValueError(f"method must be one of {', '.join(METHODS)}, got {self.method!r}")
-        if self.joint and not METHODS[self.method].trains_jointly:
-            joint = [name for name, method in METHODS.items() if method.trains_jointly]
-            raise ValueError(f"joint training needs method {' or '.join(joint)}, got {self.method!r}")
+        if self.joint and self.method not in JOINT_METHODS:
+            raise ValueError(f"joint training needs method {' or '.join(JOINT_METHODS)}, got {self.method!r}")
         if not self.checkpoint_seconds >= 0:
             raise ValueError(f"checkpoint_seconds must be at least 0, got {self.checkpoint_seconds:g}")
         if self.iterations is not None and self.iterations < 1:
@@ -158,7 +157,7 @@ class BuildConfig:
         Memory, workers, checkpoints, the device of the encoders, settings of methods that are not used, and features
         that take no part.
         """
-        used = METHODS[self.method].settings
+        used = self.language_method.settings
         unused = {part for method in METHODS.values() for part in method.settings} - set(used)
         usual = BuildConfig()
         idle: dict[str, Any] = {
@@ -167,10 +166,29 @@ class BuildConfig:
         }
         return replace(self, features=self.features.result_settings(use_dino=self.uses_dino), **idle)
 
+    @cached_property
+    def memory_bytes(self) -> int:
+        """`memory` in bytes."""
+        return parse_bytes(self.memory)
+
     @property
     def uses_dino(self) -> bool:
         """Whether DINO features take part."""
-        return self.dino != "none" and METHODS[self.method].uses_dino(self)
+        return self.dino != "none" and self.language_method.uses_dino(self)
+
+    @property
+    def language_method(self) -> LanguageMethod:
+        """The method as an object."""
+        return (JOINT_METHODS if self.joint else METHODS)[self.method]
+
+    def refuse_beside_splats(self) -> None:
+        """Refuse settings that make Gaussians of their own where Gaussians are given.
+
+        Raises:
+            ValueError: If they do.
+        """
+        if self.joint:
+            raise ValueError("joint training makes its own Gaussians: leave --splats out, or --joint")
 
     def spelled_out(self) -> BuildConfig:
         """With `as_in_paper`, the settings that it stands for; otherwise the same."""

@@ -18,7 +18,6 @@ from lexsplat.pipeline.provenance import with_full_paths
 from lexsplat.pipeline.scene_progress import LastEvent, named, named_messages, relayed
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path
-from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.workers import Needs, Outcome, SharedFolder, Workers, raise_failures
 
@@ -85,7 +84,7 @@ def _extract_view(shared: _Extraction, view: View) -> dict[str, bytes]:
     capture = replace(shared.capture, views={view.name: view}, train_names=(view.name,), test_names=())
 
     def extract(folder: Path) -> None:
-        memory = parse_bytes(config.memory)
+        memory = config.memory_bytes
         extract_features(
             capture, encoders.clip, encoders.dino, config.features, cache_dir=folder, memory=memory
         )
@@ -175,7 +174,7 @@ def build_scenes(
     Raises:
         WorkersError: If a worker does not see the output.
     """
-    memory = max((parse_bytes(task.config.memory) for task in tasks.values()), default=0)
+    memory = max((task.config.memory_bytes for task in tasks.values()), default=0)
     on_gpu = any(task.config.device != "cpu" for task in tasks.values())
     needs = Needs(memory=memory + LIBRARIES_BYTES, libraries=LIBRARIES_BYTES, gpu=on_gpu)
     with SharedFolder.offered(output) as folder:

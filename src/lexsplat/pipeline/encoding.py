@@ -19,7 +19,6 @@ from lexsplat.features.hub import model_folder
 from lexsplat.features.masking import without_masked_cells
 from lexsplat.features.segments2d import load_segmenter, pooled_features
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import NOTE, Event, Listener, silent
 
 if TYPE_CHECKING:
@@ -195,7 +194,7 @@ def feature_maps(
         cache_dir: Folder of stored features.
         listener: Receives events of stage "features".
     """
-    memory = parse_bytes(config.memory)
+    memory = config.memory_bytes
     if config.features_from is None:
         clip, dino = encoders.clip, encoders.dino
         if not encoders.told:

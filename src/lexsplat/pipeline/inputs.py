@@ -41,7 +41,6 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import CaptureError, SceneFolderError
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.runtime.memory import parse_bytes
 from lexsplat.runtime.progress import Listener
 from lexsplat.scenes.folder import SceneFolder
 
@@ -225,7 +224,7 @@ def _registered_images(
     source: Path, photos: Path, folder: SceneFolder, config: BuildConfig, listener: Listener
 ) -> str:
     """Run structure from motion unless its result is up to date; returns the folder of the images that have poses."""
-    poses, memory = folder.root / "poses", parse_bytes(config.memory)
+    poses, memory = folder.root / "poses", config.memory_bytes
     key = _photos_fingerprint(source, photos, folder.root, config)
     images = folder.record["stages"].get("poses", {}).get("images")
     kept = images is not None and (folder.root / images).is_dir() and (poses / "sparse" / "0").is_dir()

@@ -19,7 +19,6 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.reconstruction.trainer import Reconstructor
 from lexsplat.runtime.errors import TrainingError
-from lexsplat.runtime.memory import DEFAULT_MEMORY
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture
@@ -39,7 +38,6 @@ class PartReconstructor(Reconstructor):
         points: Initial points of the whole.
         device: Device of this process.
         seed: Seed of the whole.
-        memory: Budget of this process in bytes.
 
     Raises:
         TrainingError: If the views differ in size, or a process would have no point or no view.
@@ -53,7 +51,6 @@ class PartReconstructor(Reconstructor):
         *,
         device: torch.device | str = "cuda",
         seed: int = 0,
-        memory: int = DEFAULT_MEMORY,
     ) -> None:
         self._rank, self._ranks = distributed.get_rank(), distributed.get_world_size()
         sizes = {(view.camera.width, view.camera.height) for view in capture.train_views}
@@ -83,7 +80,7 @@ class PartReconstructor(Reconstructor):
             # The weights of a part alone would not know what the other parts hide.
             renewal=config.renewal if self._ranks == 1 else 0.0,
         )
-        super().__init__(capture, part, own, device=device, seed=seed + self._rank, memory=memory)
+        super().__init__(capture, part, own, device=device, seed=seed + self._rank)
         self._generator = torch.Generator().manual_seed(seed)  # one order of views in all processes
 
     def _next_view(self) -> int:

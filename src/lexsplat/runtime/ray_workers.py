@@ -158,11 +158,7 @@ def _sees(folder: SharedFolder) -> bool:
 
 
 def _check_nodes(paths: tuple[Path, ...]) -> int:
-    """Run a probe on every node; returns their number.
-
-    Raises:
-        WorkersError: If a node cannot do the work.
-    """
+    """Run a probe on every node; returns their number."""
     import ray
 
     def probe(files: list[str]) -> tuple[str, str, list[str], dict[str, str]]:

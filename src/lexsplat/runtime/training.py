@@ -229,14 +229,13 @@ class DivergenceGuard:
         training: The training, in a good state.
         name: Name of the training in messages.
         every: Steps between two copies of the state.
-        attempts: How often to go back before giving up.
 
     Raises:
-        TrainingError: From the block, if the training diverged more than ``attempts`` times.
+        TrainingError: From the block, if the training diverged more than `ATTEMPTS` times.
     """
 
-    def __init__(self, training: Training, name: str, *, every: int = 100, attempts: int = ATTEMPTS) -> None:
-        self._training, self._name, self._every, self._left = training, name, every, attempts
+    def __init__(self, training: Training, name: str, *, every: int = 100) -> None:
+        self._training, self._name, self._every, self._left = training, name, every, ATTEMPTS
         self._steps = self._kept_at = 0
         self._good = _on_host(training.state_dict())
 

@@ -188,11 +188,7 @@ def refuse_existing(files: Sequence[Path]) -> None:
 
 
 def _check_language_fits(path: Path, language: bool) -> None:
-    """Refuse language in a format that cannot hold it.
-
-    Raises:
-        SceneFolderError: If the ending is neither ``.ply`` nor ``.glb``.
-    """
+    """Refuse language in a format that cannot hold it."""
     if language and ending_of(path) not in (".ply", ".glb"):
         raise SceneFolderError(
             path, expected="a name that ends in .ply or .glb", found="a format without room for language"

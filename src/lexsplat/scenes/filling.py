@@ -60,15 +60,17 @@ _SIZES = (0.8, 0.8, 0.1)
 _OPAQUE = 3.0
 _COLUMNS = 13
 _MOST = 1 << 20
+_GROWN = 1.05
+"""Factor by which the convex hull of a thing is enlarged."""
 
 
-def inside_hull(means: FloatArray, thing: NDArray[np.bool_], grown: float = 1.05) -> NDArray[np.bool_]:
-    """Which Gaussians lie in the convex hull of a thing, grown about its center ``[N]``."""
+def inside_hull(means: FloatArray, thing: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which Gaussians lie in the convex hull of a thing, enlarged about its center ``[N]``."""
     points = means[thing]
     try:
         corners = points[ConvexHull(points).vertices] if len(points) > 3 else points
         center = corners.mean(0)
-        return np.asarray(Delaunay(center + grown * (corners - center)).find_simplex(means) >= 0)
+        return np.asarray(Delaunay(center + _GROWN * (corners - center)).find_simplex(means) >= 0)
     except (QhullError, ValueError, IndexError):  # flat or too few
         return thing.copy()
 

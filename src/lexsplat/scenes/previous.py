@@ -14,6 +14,7 @@ import tempfile
 from pathlib import Path
 
 from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.files import link_or_copy
 from lexsplat.scenes.folder import SCENE_FILES, SceneFolder
 
 FOLDER = "previous"
@@ -35,7 +36,7 @@ def keep_previous(folder: SceneFolder) -> None:
         # A temporary folder is private to its owner; the kept files are as readable as the scene.
         made.chmod(stat.S_IMODE(folder.root.stat().st_mode))
         for name in SCENE_FILES:
-            _link(folder.root / name, made / name)
+            link_or_copy(folder.root / name, made / name)
         os.replace(made, folder.root / FOLDER)
     folder.record["building"] = True
 
@@ -71,10 +72,3 @@ def require_current(folder: SceneFolder) -> None:
             found="one at work, or stopped half way",
             remedy="wait for it, or run the build again",
         )
-
-
-def _link(source: Path, target: Path) -> None:
-    try:
-        os.link(source, target)
-    except OSError:  # a file system without links
-        shutil.copyfile(source, target)

@@ -67,12 +67,7 @@ def _state(folder: SceneFolder) -> tuple[Any, Any]:
 
 
 def _read_content(folder: SceneFolder, device: str) -> SceneContent:
-    """One version of a scene.
-
-    Raises:
-        SceneFolderError: If it is incomplete.
-        FileFormatError: If a file is damaged.
-    """
+    """One version of a scene."""
     if "language" not in folder.record["stages"] or not folder.language_path.exists():
         finished = ", ".join(folder.record["stages"]) or "none"
         lost = "language" in folder.record["stages"]

@@ -31,7 +31,7 @@ from lexsplat.captures.images.reading import (
 from lexsplat.captures.readers.camera_files import checked_name
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError
-from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.files import atomic_path, link_or_copy
 from lexsplat.runtime.progress import Event, Listener, silent
 
 STAGE = "photos"
@@ -279,19 +279,12 @@ def _copy_photos(
         if not (target.is_file() and target.stat().st_mtime_ns == stamp):
             with atomic_path(target) as temporary:
                 if photo.plain and photo.orientation == 1:
-                    _link(source, temporary)
+                    link_or_copy(source, temporary)
                 else:
                     _write_upright(photo, source, temporary)
                     # The copy gets its photo's modification time, by which the next call recognizes it.
                     os.utime(temporary, ns=(stamp, stamp))
         listener(Event(STAGE, done, len(photos)))
-
-
-def _link(source: Path, target: Path) -> None:
-    try:
-        os.link(source, target)
-    except OSError:  # another file system, or one without hard links
-        shutil.copy2(source, target)
 
 
 def _write_upright(photo: _Photo, source: Path, target: Path) -> None:
@@ -327,11 +320,7 @@ def _write_masks(
 
 
 def _fitted_mask(mask: NDArray[np.bool_], photo: _Photo, subject: Path) -> NDArray[np.bool_]:
-    """A mask ``[H, W]`` at the photo's upright size; one drawn on the stored pixels is rotated with them.
-
-    Raises:
-        CaptureError: If its aspect is not the photo's.
-    """
+    """A mask ``[H, W]`` at the photo's upright size; one drawn on the stored pixels is rotated with them."""
     size = (mask.shape[1], mask.shape[0])
     if not sizes_agree(size, photo.size) and photo.orientation >= 5 and sizes_agree(size[::-1], photo.size):
         mask = turned_upright(mask, photo.orientation)

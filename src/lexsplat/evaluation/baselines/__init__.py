@@ -14,11 +14,11 @@ A new one is a file with a class like `Dff`, and an entry in `BASELINES`; tables
 from collections.abc import Mapping
 
 from lexsplat.evaluation.baselines.baseline import Baseline, BaselineRun
-from lexsplat.evaluation.baselines.dff import Dff, DffConfig, distill
+from lexsplat.evaluation.baselines.dff import Dff, DffConfig
 from lexsplat.evaluation.baselines.feature_rendering import GaussianFeatures, TrainingData
-from lexsplat.evaluation.baselines.lerf import Lerf, LerfConfig, fit_lerf
+from lexsplat.evaluation.baselines.lerf import Lerf, LerfConfig
 from lexsplat.evaluation.baselines.nearest import Nearest, ViewFeatures
-from lexsplat.evaluation.baselines.ovs3d import ClassFeatures, Ovs3d, Ovs3dConfig, fit_3dovs
+from lexsplat.evaluation.baselines.ovs3d import ClassFeatures, Ovs3d, Ovs3dConfig
 
 __all__ = [
     "BASELINES",
@@ -35,9 +35,6 @@ __all__ = [
     "Ovs3dConfig",
     "TrainingData",
     "ViewFeatures",
-    "distill",
-    "fit_3dovs",
-    "fit_lerf",
 ]
 
 BASELINES: Mapping[str, Baseline] = {method.name: method for method in (Dff(), Lerf(), Ovs3d(), Nearest())}

@@ -20,13 +20,12 @@ from lexsplat.evaluation.baselines.feature_rendering import (
     back_projected_mean,
     resized_map,
 )
-from lexsplat.runtime.memory import DEFAULT_MEMORY
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Event
 
 
 @dataclass(frozen=True)
 class DffConfig:
-    """Settings of `distill`.
+    """Settings of `Dff`.
 
     Args:
         steps: Gradient steps per chunk of channels; 0 keeps the back-projected mean.
@@ -39,55 +38,6 @@ class DffConfig:
     scale: int = 2
 
 
-def distill(
-    data: TrainingData,
-    config: DffConfig | None = None,
-    *,
-    seed: int = 0,
-    memory: int = DEFAULT_MEMORY,
-    listener: Listener = silent,
-) -> GaussianFeatures:
-    """Fit CLIP features to the Gaussians.
-
-    Args:
-        data: Gaussians, training views and features.
-        config: Settings.
-        seed: Seed of the order of the views.
-        memory: Memory budget in bytes; results do not depend on it.
-        listener: Receives events of stage "dff".
-    """
-    config = config or DffConfig()
-    maps, views = data.maps, data.views(memory, scale=config.scale)
-    dimensions = maps[views.names[0]].clip.shape[-1]
-    ranges = [slice(start, start + CHANNELS) for start in range(0, dimensions, CHANNELS)]
-    total = len(views.names) + config.steps * len(ranges)
-    features, weights = back_projected_mean(
-        views,
-        lambda name, camera: resized_map(maps[name].clip, camera),
-        listener=lambda done: listener(Event("dff", done, total)),
-    )
-    seen = (weights > 0)[:, None]
-    generator = torch.Generator().manual_seed(seed)
-    done = len(views.names)
-    for columns in ranges:
-        part = features[:, columns].clone().requires_grad_()
-        optimizer = torch.optim.Adam([part], lr=config.learning_rate)
-        for step, name in enumerate(views.order(config.steps, generator)):
-            for group in optimizer.param_groups:
-                group["lr"] = config.learning_rate * 0.1 ** (step / config.steps)
-            rendered = views.render(name, part)
-            target = resized_map(maps[name].clip[..., columns].to(part.device), views.prepared(name)[0])
-            loss = (rendered - target).square().sum(-1).mean()
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            optimizer.step()
-            done += 1
-            if done % 20 == 0 or done == total:
-                listener(Event("dff", done, total, {"loss": float(loss.detach())}))
-        features[:, columns] = torch.where(seen, part.detach(), 0.0)
-    return GaussianFeatures("dff", features[None])
-
-
 @dataclass(frozen=True)
 class Dff:
     """The baseline."""
@@ -97,5 +47,34 @@ class Dff:
     knows_prompts: ClassVar[bool] = False
 
     def fit(self, data: TrainingData, run: BaselineRun) -> GaussianFeatures:
-        """`distill`."""
-        return distill(data, self.settings, seed=run.seed, memory=run.memory, listener=run.listener)
+        """Fit CLIP features to the Gaussians; events are of stage "dff"."""
+        config = self.settings
+        maps, views = data.maps, data.views(run.memory, scale=config.scale)
+        dimensions = maps[views.names[0]].clip.shape[-1]
+        ranges = [slice(start, start + CHANNELS) for start in range(0, dimensions, CHANNELS)]
+        total = len(views.names) + config.steps * len(ranges)
+        features, weights = back_projected_mean(
+            views,
+            lambda name, camera: resized_map(maps[name].clip, camera),
+            listener=lambda done: run.listener(Event("dff", done, total)),
+        )
+        seen = (weights > 0)[:, None]
+        generator = torch.Generator().manual_seed(run.seed)
+        done = len(views.names)
+        for columns in ranges:
+            part = features[:, columns].clone().requires_grad_()
+            optimizer = torch.optim.Adam([part], lr=config.learning_rate)
+            for step, name in enumerate(views.order(config.steps, generator)):
+                for group in optimizer.param_groups:
+                    group["lr"] = config.learning_rate * 0.1 ** (step / config.steps)
+                rendered = views.render(name, part)
+                target = resized_map(maps[name].clip[..., columns].to(part.device), views.prepared(name)[0])
+                loss = (rendered - target).square().sum(-1).mean()
+                optimizer.zero_grad(set_to_none=True)
+                loss.backward()
+                optimizer.step()
+                done += 1
+                if done % 20 == 0 or done == total:
+                    run.listener(Event("dff", done, total, {"loss": float(loss.detach())}))
+            features[:, columns] = torch.where(seen, part.detach(), 0.0)
+        return GaussianFeatures("dff", features[None])

@@ -31,13 +31,12 @@ from lexsplat.evaluation.baselines.feature_rendering import (
 )
 from lexsplat.geometry.cameras import Camera
 from lexsplat.rendering import render
-from lexsplat.runtime.memory import DEFAULT_MEMORY
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Event
 
 
 @dataclass(frozen=True)
 class LerfConfig:
-    """Settings of `fit_lerf`.
+    """Settings of `Lerf`.
 
     Args:
         scales: Number of physical scales.
@@ -48,48 +47,6 @@ class LerfConfig:
     scales: int = 4
     neighbors: int = 8
     sharpness: float = 10.0
-
-
-def fit_lerf(
-    data: TrainingData,
-    config: LerfConfig | None = None,
-    *,
-    memory: int = DEFAULT_MEMORY,
-    listener: Listener = silent,
-) -> GaussianFeatures:
-    """Average CLIP at each scale over the training views, then over similar neighbors.
-
-    Args:
-        data: Gaussians, training views, features (their DINO part regularizes) and features of each crop size.
-        config: Settings.
-        memory: Memory budget in bytes; results do not depend on it.
-        listener: Receives events of stage "lerf".
-    """
-    config = config or LerfConfig()
-    maps, level_maps, views = data.maps, data.levels(), data.views(memory)
-    scales = physical_scales(views, level_maps, config.scales)
-    total = (config.scales + 1) * len(views.names)
-    found = []
-    for index, scale in enumerate(scales.tolist()):
-        offset = index * len(views.names)
-        features, _ = back_projected_mean(
-            views,
-            lambda name, camera, scale=scale: _map_at_scale(views, name, camera, level_maps, scale),  # type: ignore[misc]
-            listener=lambda done, offset=offset: listener(Event("lerf", offset + done, total)),  # type: ignore[misc]
-        )
-        found.append(features)
-    stacked = torch.stack(found)
-    del found, features
-    with_dino = maps[views.names[0]].dino is not None
-    if config.neighbors and with_dino and len(data.gaussians) > 1:
-        dino, _ = back_projected_mean(
-            views,
-            lambda name, camera: resized_map(maps[name].dino, camera),  # type: ignore[arg-type]  # see with_dino
-            listener=lambda done: listener(Event("lerf", total - len(views.names) + done, total)),
-        )
-        stacked = smooth_by_similarity(data.gaussians.means, dino, stacked, config)
-    listener(Event("lerf", total, total))
-    return GaussianFeatures("lerf", stacked, scales)
 
 
 def physical_scales(views: TrainingViews, level_maps: LevelMaps, count: int) -> Tensor:
@@ -187,5 +144,32 @@ class Lerf:
     knows_prompts: ClassVar[bool] = False
 
     def fit(self, data: TrainingData, run: BaselineRun) -> GaussianFeatures:
-        """`fit_lerf`, which needs no seed."""
-        return fit_lerf(data, self.settings, memory=run.memory, listener=run.listener)
+        """Average CLIP at each scale over the training views, then over similar neighbors.
+
+        The DINO part of the features regularizes. The seed has no effect. Events are of stage "lerf".
+        """
+        config = self.settings
+        maps, level_maps, views = data.maps, data.levels(), data.views(run.memory)
+        scales = physical_scales(views, level_maps, config.scales)
+        total = (config.scales + 1) * len(views.names)
+        found = []
+        for index, scale in enumerate(scales.tolist()):
+            offset = index * len(views.names)
+            features, _ = back_projected_mean(
+                views,
+                lambda name, camera, scale=scale: _map_at_scale(views, name, camera, level_maps, scale),  # type: ignore[misc]
+                listener=lambda done, offset=offset: run.listener(Event("lerf", offset + done, total)),  # type: ignore[misc]
+            )
+            found.append(features)
+        stacked = torch.stack(found)
+        del found, features
+        with_dino = maps[views.names[0]].dino is not None
+        if config.neighbors and with_dino and len(data.gaussians) > 1:
+            dino, _ = back_projected_mean(
+                views,
+                lambda name, camera: resized_map(maps[name].dino, camera),  # type: ignore[arg-type]  # see with_dino
+                listener=lambda done: run.listener(Event("lerf", total - len(views.names) + done, total)),
+            )
+            stacked = smooth_by_similarity(data.gaussians.means, dino, stacked, config)
+        run.listener(Event("lerf", total, total))
+        return GaussianFeatures("lerf", stacked, scales)

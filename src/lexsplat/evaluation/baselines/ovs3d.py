@@ -33,13 +33,12 @@ from lexsplat.evaluation.baselines.feature_rendering import (
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.relevancy import QueryConfig, Question
-from lexsplat.runtime.memory import DEFAULT_MEMORY
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Event
 
 
 @dataclass(frozen=True)
 class Ovs3dConfig:
-    """Settings of `fit_3dovs`; weights follow the authors' configuration unless stated.
+    """Settings of `Ovs3d`; weights follow the authors' configuration unless stated.
 
     Args:
         steps: Gradient steps, one training view each.
@@ -142,54 +141,6 @@ def alignment_loss(log_classes: Tensor, dino: Tensor, config: Ovs3dConfig) -> Te
     return loss
 
 
-def fit_3dovs(
-    data: TrainingData,
-    classes: Tensor,
-    config: Ovs3dConfig | None = None,
-    *,
-    seed: int = 0,
-    memory: int = DEFAULT_MEMORY,
-    listener: Listener = silent,
-) -> ClassFeatures:
-    """Fit features to the Gaussians for known classes.
-
-    Args:
-        data: Gaussians, training views, features and features of each crop size. The DINO part of the features, if
-            there is one, enters the feature-distribution alignment.
-        classes: Text embeddings ``[K, D]`` of all classes.
-        config: Settings.
-        seed: Seed of views and pixels.
-        memory: Memory budget in bytes; results do not depend on it.
-        listener: Receives events of stage "3dovs".
-
-    Raises:
-        ValueError: If there are fewer than two classes.
-    """
-    if len(classes) < 2:
-        raise ValueError(f"3dovs needs at least two classes, got {len(classes)}")
-    config = config or Ovs3dConfig()
-    (classes,) = unit_texts(classes)
-    views = data.views(memory)
-    total = len(views.names) + config.steps
-    start, weights = back_projected_mean(
-        views,
-        lambda name, camera: resized_map(data.maps[name].clip, camera),
-        listener=lambda done: listener(Event("3dovs", done, total)),
-    )
-    fit = _Fit(data, views, start, classes.to(start.device), config)
-    optimizer = torch.optim.Adam([fit.features, fit.choices], lr=config.learning_rate)
-    generator = torch.Generator().manual_seed(seed)
-    for step, name in enumerate(views.order(config.steps, generator), start=1):
-        loss = fit.loss(name, generator)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
-        if step % 10 == 0 or step == config.steps:
-            listener(Event("3dovs", len(views.names) + step, total, {"loss": float(loss.detach())}))
-    fitted = torch.where((weights > 0)[:, None], fit.features.detach(), 0.0)
-    return ClassFeatures(fitted, fit.classes)
-
-
 class _Fit:
     """The optimized tensors and their loss."""
 
@@ -243,13 +194,34 @@ class Ovs3d:
     knows_prompts: ClassVar[bool] = True
 
     def fit(self, data: TrainingData, run: BaselineRun) -> ClassFeatures:
-        """`fit_3dovs` with the prompts as classes.
+        """Fit features to the Gaussians with the prompts as classes; events are of stage "3dovs".
+
+        The DINO part of the features, if there is one, enters the feature-distribution alignment.
 
         Raises:
             ValueError: If there are fewer than two prompts.
         """
-        if run.classes is None:
-            raise ValueError("3dovs needs the prompts of the evaluation (classes)")
-        return fit_3dovs(
-            data, run.classes, self.settings, seed=run.seed, memory=run.memory, listener=run.listener
+        if run.classes is None or len(run.classes) < 2:
+            found = 0 if run.classes is None else len(run.classes)
+            raise ValueError(f"3dovs needs the prompts of the evaluation, at least two classes, got {found}")
+        config = self.settings
+        (classes,) = unit_texts(run.classes)
+        views = data.views(run.memory)
+        total = len(views.names) + config.steps
+        start, weights = back_projected_mean(
+            views,
+            lambda name, camera: resized_map(data.maps[name].clip, camera),
+            listener=lambda done: run.listener(Event("3dovs", done, total)),
         )
+        fit = _Fit(data, views, start, classes.to(start.device), config)
+        optimizer = torch.optim.Adam([fit.features, fit.choices], lr=config.learning_rate)
+        generator = torch.Generator().manual_seed(run.seed)
+        for step, name in enumerate(views.order(config.steps, generator), start=1):
+            loss = fit.loss(name, generator)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            optimizer.step()
+            if step % 10 == 0 or step == config.steps:
+                run.listener(Event("3dovs", len(views.names) + step, total, {"loss": float(loss.detach())}))
+        fitted = torch.where((weights > 0)[:, None], fit.features.detach(), 0.0)
+        return ClassFeatures(fitted, fit.classes)

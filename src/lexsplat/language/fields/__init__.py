@@ -15,12 +15,7 @@ from torch import Tensor
 
 from lexsplat.language.fields.codes import CodeField
 from lexsplat.language.fields.protocol import LanguageField
-from lexsplat.language.fields.smoothing import (
-    SEMANTIC_CHANNELS,
-    SmoothingMLP,
-    positional_encoding,
-    scene_box,
-)
+from lexsplat.language.fields.smoothing import SEMANTIC_CHANNELS, SmoothingMLP, positional_encoding, scene_box
 from lexsplat.language.fields.trained import INITIAL_UNCERTAINTY, TrainedField
 
 __all__ = [

@@ -77,7 +77,7 @@ class Averaged:
     name = "averaged"
     settings = ("codebook", "averaged")
     needs = ("features",)
-    trains_jointly = False
+    stages = ("reconstruct", *needs, "language")
     variants: Mapping[str, Variant] = {
         "one code": {"averaged": {"top": 1}},
         "with DINO": {"averaged": {"dino": True}},

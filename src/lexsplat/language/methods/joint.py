@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -20,12 +21,55 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import check_views
 from lexsplat.language.fields import TrainedField
+from lexsplat.language.methods.method import FitRun, TrainingViews
+from lexsplat.language.methods.trained import Trained
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.reconstruction import EVENT_EVERY, STAGE, Reconstructor
 from lexsplat.reconstruction.optimizers import below_prefix, with_prefix
+from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.runtime.training import Checkpoint, run_training
+
+
+class TrainedJointly(Trained):
+    """The method as an object (`lexsplat.language.methods.JointMethod`)."""
+
+    stages = (*Trained.needs, "reconstruct", "language")
+
+    def geometry_inputs(self, config: Any) -> list[Any]:
+        """What the language depends on, which the same training makes."""
+        return ["codebook", config.trained]
+
+    def geometry_outputs(self, scratch: Path) -> list[Path]:
+        """The field."""
+        return [scratch / "joint_language.safetensors"]
+
+    def joined(
+        self, reconstructor: Reconstructor, views: TrainingViews, config: Any, seed: int
+    ) -> JointTrainer:
+        """A `JointTrainer` with the index maps of the training views."""
+        return JointTrainer(reconstructor, views.cameras, *views.require_codes(), config.trained, seed=seed)
+
+    def fit_geometry(self, training: JointTrainer, run: FitRun) -> Gaussians:
+        """Train both and keep the field.
+
+        Raises:
+            ValueError: If there is no scratch folder.
+        """
+        training.run(run.listener, run.checkpoint)
+        gaussians, field = training.result()
+        write_tensors(self._kept(run), field.tensors(), field.metadata())
+        return gaussians
+
+    def fit(self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> TrainedField:
+        """The field that `fit_geometry` kept."""
+        return TrainedField.from_tensors(*read_tensors(self._kept(run)))
+
+    def _kept(self, run: FitRun) -> Path:
+        if run.scratch is None:
+            raise ValueError("joint training needs a scratch folder that lasts")
+        return self.geometry_outputs(run.scratch)[0]
 
 
 class JointTrainer:
@@ -60,31 +104,18 @@ class JointTrainer:
     ) -> None:
         check_views(sorted(cameras), code_maps)
         reconstructor.tracks_origins = True
-        self.reconstructor, self.code_maps, self.codebook, self.seed = (
-            reconstructor,
-            code_maps,
-            codebook,
-            seed,
-        )
+        self.reconstructor, self.code_maps = reconstructor, code_maps
+        self.codebook, self.seed = codebook, seed
+        self.device, self.total_steps = reconstructor.device, reconstructor.total_steps
         self.config = replace(config, iterations=reconstructor.config.iterations)
         self.cameras = {name: camera.downscaled(config.render_downscale) for name, camera in cameras.items()}
         self.language = FieldTrainer(reconstructor.gaussians(), codebook, self.config, seed=seed)
         self._losses = {"loss": float("nan")}
 
     @property
-    def device(self) -> torch.device:
-        """Where the training runs."""
-        return self.reconstructor.device
-
-    @property
     def steps_done(self) -> int:
         """Number of finished steps."""
         return self.reconstructor.steps_done
-
-    @property
-    def total_steps(self) -> int:
-        """Number of steps of the whole training."""
-        return self.reconstructor.total_steps
 
     @property
     def metrics(self) -> dict[str, float]:

@@ -21,6 +21,8 @@ from lexsplat.runtime.progress import Listener, silent
 from lexsplat.runtime.workers import IN_PROCESS, Workers
 
 if TYPE_CHECKING:
+    from lexsplat.language.methods.joint import JointTrainer
+    from lexsplat.reconstruction import Reconstructor
     from lexsplat.runtime.training import Checkpoint
 
 Variant = Mapping[str, Mapping[str, Any]]
@@ -105,12 +107,12 @@ class LanguageMethod(Protocol):
     def needs(self) -> tuple[str, ...]:
         """Stages before "language" that it needs beside the Gaussians, in order."""
 
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """All stages of a build, in the order in which they run."""
+
     def uses_dino(self, config: Any) -> bool:
         """Whether DINO features take part in a build of these settings."""
-
-    @property
-    def trains_jointly(self) -> bool:
-        """Whether it can also be trained together with the reconstruction (``--joint``)."""
 
     @property
     def variants(self) -> Mapping[str, Variant]:
@@ -125,3 +127,21 @@ class LanguageMethod(Protocol):
             config: The build settings (`lexsplat.pipeline.config.BuildConfig`), of which `settings` are read.
             run: Seed, memory, checkpoint and listener.
         """
+
+
+class JointMethod(LanguageMethod, Protocol):
+    """A method that trains the geometry, too (``--joint``). Its `fit` takes the language that `fit_geometry` kept."""
+
+    def geometry_inputs(self, config: Any) -> list[Any]:
+        """What its Gaussians depend on beside the reconstruction; the name of a stage stands for its inputs."""
+
+    def geometry_outputs(self, scratch: Path) -> list[Path]:
+        """Files in which `fit_geometry` keeps the language."""
+
+    def joined(
+        self, reconstructor: Reconstructor, views: TrainingViews, config: Any, seed: int
+    ) -> JointTrainer:
+        """The training of both, before its first step and that of the reconstruction."""
+
+    def fit_geometry(self, training: JointTrainer, run: FitRun) -> Gaussians:
+        """Run the training; returns the Gaussians and keeps the language in ``run.scratch``."""

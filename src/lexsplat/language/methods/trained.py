@@ -37,7 +37,7 @@ class Trained:
     name = "trained"
     settings = ("codebook", "trained")
     needs = ("features", "codebook")
-    trains_jointly = True
+    stages: tuple[str, ...] = ("reconstruct", *needs, "language")
     variants: Mapping[str, Variant] = {  # the rows of the paper's Table 2, in its order
         "w/o DINO": {"codebook": {"use_dino": False}},
         "w/o L_lb": {"codebook": {"load_balancing": False}},

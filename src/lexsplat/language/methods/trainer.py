@@ -36,7 +36,6 @@ class FieldTrainer:
         codebook: The discrete feature space S.
         config: Settings.
         seed: Seed of the initial field and of all samples.
-        field: A field to continue from; None takes `TrainedField.initial`.
     """
 
     parameter_prefixes: tuple[str, ...] = ("field.",)
@@ -48,7 +47,6 @@ class FieldTrainer:
         config: TrainedConfig,
         *,
         seed: int = 0,
-        field: TrainedField | None = None,
     ) -> None:
         self.config = config
         self.seed = seed
@@ -58,15 +56,13 @@ class FieldTrainer:
         self._first_loss = math.nan
         self.generator = torch.Generator().manual_seed(seed)
         self.gaussians = gaussians.detach()
-        self.field = field or TrainedField.initial(
+        self.field = TrainedField.initial(
             gaussians,
             codebook,
             generator=self.generator,
             num_frequencies=config.num_frequencies,
             normalize_rendering=config.normalize_rendering,
         )
-        if len(self.field.semantics) != len(gaussians):
-            raise ValueError(f"{len(gaussians)} Gaussians, but the field has {len(self.field.semantics)}")
         self.optimizer = self._make_optimizer()
 
     def _make_optimizer(self) -> torch.optim.Optimizer:

@@ -11,15 +11,7 @@ from typing import Any
 import numpy as np
 
 from lexsplat.rendering.kernels.arrays import F32, I32, I64, U8
-from lexsplat.rendering.kernels.binning import (
-    CENTER_X,
-    CENTER_Y,
-    CONIC_B,
-    HALF_A,
-    HALF_C,
-    OPACITY,
-    TILE,
-)
+from lexsplat.rendering.kernels.binning import CENTER_X, CENTER_Y, CONIC_B, HALF_A, HALF_C, OPACITY, TILE
 from lexsplat.rendering.kernels.jit import kernel
 from lexsplat.rendering.kernels.lanes import LANES, any_positive, load, select_greater, store
 

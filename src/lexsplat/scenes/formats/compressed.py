@@ -111,11 +111,7 @@ def read_compressed(path: Path, kind: str) -> Gaussians:
 
 
 def _chunked_count(lines: list[str], content: bytes, path: Path) -> int:
-    """Number of Gaussians of a compressed PLY, which must be that of its chunks and of its data.
-
-    Raises:
-        FileFormatError: If it is another.
-    """
+    """Number of Gaussians of a compressed PLY, which must be that of its chunks and of its data."""
     elements = parse_elements(lines, path)
     counts = {element.name: element.count for element in elements}
     count = counts.get("vertex", 0)
@@ -137,11 +133,7 @@ def _chunked_count(lines: list[str], content: bytes, path: Path) -> int:
 
 
 def _sectioned_count(content: bytes, path: Path) -> int:
-    """Number of Gaussians of a ``.ksplat``, which must be that of its sections and of its data.
-
-    Raises:
-        FileFormatError: If it is another.
-    """
+    """Number of Gaussians of a ``.ksplat``, which must be that of its sections and of its data."""
     try:
         sections, _, _, count, level = _KSPLAT.unpack_from(content)
         place, held = _KSPLAT_HEADER + _KSPLAT_SECTION * sections, 0

@@ -201,9 +201,6 @@ class _Document:
         """Refuse attributes of different counts, and counts that leave out elements of all attributes.
 
         Zeros that pad the views are no Gaussians, since no rotation is four zeros.
-
-        Raises:
-            Damage: If they do.
         """
         counts = sorted({self.item("accessors", index)["count"] for index in indices})
         if len(counts) > 1:
@@ -290,11 +287,7 @@ def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
 
 
 def _placed(gaussians: Gaussians, world: NDArray[np.float64], path: Path) -> Gaussians:
-    """The Gaussians after a transformation of turn, uniform scale and translation.
-
-    Raises:
-        FileFormatError: If it is of another kind.
-    """
+    """The Gaussians after a transformation of turn, uniform scale and translation."""
     linear = world[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
     even = np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2)

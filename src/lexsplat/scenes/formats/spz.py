@@ -113,8 +113,7 @@ def read_spz(path: Path) -> Gaussians:
 def _rotation(extensions: bytes, path: Path) -> NDArray[np.float64]:
     """Rotation from the axes of the file, which an extension may name, to those of a PLY ``[3, 3]``.
 
-    Raises:
-        FileFormatError: If the axes are unknown, or left-handed: the splats would have to be mirrored.
+    Left-handed axes are refused: the splats would have to be mirrored.
     """
     rotation, place = HALF_TURN, 0
     while place + 8 <= len(extensions):
@@ -138,11 +137,7 @@ def _rotation(extensions: bytes, path: Path) -> NDArray[np.float64]:
 
 
 def _check_supported(magic: bytes, version: int, packed: bool, degree: int, bits: int, path: Path) -> None:
-    """Refuse files of another program or version, and headers that are invalid in every version.
-
-    Raises:
-        FileFormatError: If it is one.
-    """
+    """Refuse files of another program or version, and headers that are invalid in every version."""
     remedy = "export it as SPZ of one of these versions, or as .ply"
     if magic != _MAGIC or version not in ((2, 3) if packed else (4,)):
         expected, found = "SPZ of version 2 or 3 in gzip, or 4", f"version {version}"
@@ -164,8 +159,7 @@ def _check_supported(magic: bytes, version: int, packed: bool, degree: int, bits
 def _inflated(content: bytes, sizes: dict[str, int], extended: bool) -> tuple[dict[str, bytes], bytes]:
     """The streams of versions 2 and 3, and what follows them: only extensions, if the header has their flag.
 
-    Raises:
-        Damage: If the file is cut, or has more data than its count allows: the streams would be read at wrong places.
+    More data than the count allows is refused: the streams would be read at wrong places.
     """
     stream, size = zlib.decompressobj(31), _HEADER.size + sum(sizes.values())
     data = stream.decompress(content, size)
@@ -193,11 +187,7 @@ def _are_extensions(data: bytes) -> bool:
 
 
 def _inflated_4(content: bytes, sizes: dict[str, int]) -> dict[str, bytes]:
-    """The streams of version 4.
-
-    Raises:
-        Damage: If the file is cut, or sizes disagree with the count.
-    """
+    """The streams of version 4."""
     *_, number, contents = _HEADER_4.unpack_from(content)
     start, count = contents + 16 * number, sizes["alphas"]
     if contents < _HEADER_4.size:

@@ -288,11 +288,7 @@ class Server:
             start += _PAGE
 
     def _ask(self, method: str, path: str, body: Any = None) -> Any:
-        """The JSON that the server answers.
-
-        Raises:
-            LibraryError: If it does not answer in time, or with an error.
-        """
+        """The JSON that the server answers."""
         absent, late, other = self._errors
         remedy = f"the library is whole: fix the server, then run {self._mending}"
         try:

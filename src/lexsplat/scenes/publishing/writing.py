@@ -38,12 +38,7 @@ from lexsplat.scenes.publishing.sidecar import (
 )
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.text_tower import write_text_tower
-from lexsplat.scenes.publishing.vocabulary import (
-    asked_phrases,
-    page_phrases,
-    phrase_answers,
-    words_file,
-)
+from lexsplat.scenes.publishing.vocabulary import asked_phrases, page_phrases, phrase_answers, words_file
 from lexsplat.scenes.scene import Scene
 
 MOST_SPLATS = 4_000_000
@@ -289,11 +284,7 @@ def _write_folder(folder: Path, manifest: dict[str, Any], target: Path) -> int:
 
 
 def _write_single(folder: Path, manifest: dict[str, Any], target: Path) -> int:
-    """Write one HTML file that holds all files as base64; returns its size.
-
-    Raises:
-        SceneFolderError: If they are too large.
-    """
+    """Write one HTML file that holds all files as base64; returns its size."""
     data = [path for path in sorted(folder.iterdir()) if path.name not in ("page.js", "page.css")]
     size = sum(path.stat().st_size for path in data)
     if size > SINGLE_FILE_BYTES:

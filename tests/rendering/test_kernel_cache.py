@@ -1,0 +1,128 @@
+"""Compiled kernels are kept in a folder that can be written, and compilation is announced once."""
+
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from numba.core.caching import NullCache
+
+pytestmark = pytest.mark.slow
+
+
+PROBE = """
+import logging, sys
+logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+from lexsplat.rendering.kernels import binning, jit
+import numpy as np
+binning.offsets_of(np.ones((2, 3), np.int64), np.zeros(4, np.int64))
+print("hits", sum(binning.offsets_of.stats.cache_hits.values()))
+print("at", binning.offsets_of.stats.cache_path)
+"""
+
+
+def run_probe(**environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", PROBE],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout
+
+
+def test_compiled_kernels_are_reused_from_numba_cache_dir(tmp_path):
+    first, second = run_probe(NUMBA_CACHE_DIR=str(tmp_path)), run_probe(NUMBA_CACHE_DIR=str(tmp_path))
+    assert "compiling CPU kernels, once" in first
+    assert "hits 0" in first
+    assert "hits 1" in second
+    assert str(tmp_path) in second
+
+
+def test_kernels_cached_for_another_processor_are_recompiled(tmp_path):
+    # As with a home folder on a network, or a disk moved to another machine.
+    here = {"NUMBA_CACHE_DIR": str(tmp_path)}
+    run_probe(**here)
+    other = run_probe(**here, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="")
+    assert "compiling CPU kernels, once" in other
+    assert "hits 0" in other
+    assert "hits 1" in run_probe(**here)
+
+
+def test_kernels_that_are_not_compiled_are_not_announced(tmp_path):
+    # A viewer never compiles the kernels of gradients.
+    assert "compiling" in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
+    assert "compiling" not in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
+
+
+def test_only_compilation_of_this_packages_kernels_is_announced_once(monkeypatch, caplog):
+    from lexsplat.reconstruction import image_loss_kernels
+    from lexsplat.rendering.kernels import jit
+
+    monkeypatch.setattr(jit, "_announced", False)
+    monkeypatch.setattr(jit, "_dispatchers", set(jit._dispatchers))
+    image, products = np.ones((2, 3), np.float32), np.ones((3, 2, 3), np.float32)
+    with caplog.at_level(logging.INFO, logger="lexsplat"):
+        numba.njit(lambda x: x + 1)(3)
+        assert not caplog.records
+        for _ in range(2):
+            fresh = jit.kernel(image_loss_kernels._multiply.py_func)
+            fresh._cache = NullCache()
+            fresh(0, 2, image, image, products)
+    assert [record.message for record in caplog.records] == ["compiling CPU kernels, once (about 15 seconds)"]
+
+
+def test_two_processes_can_compile_at_the_same_time(tmp_path):
+    command = [sys.executable, "-c", PROBE]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    both = [
+        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        for _ in range(2)
+    ]
+    assert [process.communicate()[1] for process in both] == [b"", b""]
+    assert [process.returncode for process in both] == [0, 0]
+    assert "hits 1" in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
+
+
+def test_a_read_only_installation_caches_kernels_in_the_home_folder(tmp_path, monkeypatch):
+    from lexsplat.rendering.kernels import jit
+
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    real = Path.mkdir
+
+    def mkdir(self, *args, **options):
+        if "__pycache__" in self.parts:
+            raise PermissionError(self)
+        return real(self, *args, **options)
+
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    folder = jit._cache_folder.__wrapped__()
+    assert folder.startswith(str(tmp_path / "home" / "lexsplat" / "kernels-"))
+
+
+@pytest.mark.parametrize("homeless", [False, True])
+def test_without_a_writable_folder_kernels_go_to_a_temporary_folder(tmp_path, monkeypatch, homeless):
+    # Homeless: a container whose user has neither an entry in /etc/passwd nor HOME.
+    from lexsplat.rendering.kernels import jit
+
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(jit.tempfile, "mkdtemp", lambda prefix: str(tmp_path / prefix))
+
+    def refused(self, *args, **options):
+        raise PermissionError(self)
+
+    def no_home(self):
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "mkdir", refused)
+    if homeless:
+        monkeypatch.setattr(Path, "expanduser", no_home)
+    folder = jit._cache_folder.__wrapped__()
+    assert folder == str(tmp_path / "lexsplat-kernels-")
