@@ -10,6 +10,7 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from lexsplat.captures import Capture, View, load_annotations
 from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
-from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook
+from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook, tell_codebook
 from lexsplat.features import FeatureMaps
 from lexsplat.geometry.world import World, parse_vector
 from lexsplat.language.code_maps import MaskedCodeMaps, mark_masked_cells
@@ -29,6 +30,7 @@ from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps, f
 from lexsplat.pipeline.inputs import (
     PhotoSurvey,
     check_given_maps,
+    check_photos,
     prepare_capture,
     refuse_without_cameras,
     survey_photos,
@@ -37,13 +39,18 @@ from lexsplat.pipeline.provenance import features_identity, model_place, with_fu
 from lexsplat.pipeline.splats import check_agreement, existing_splats, splats_hash
 from lexsplat.pipeline.viewpoints import capture_of_splats, splats_of_capture
 from lexsplat.pipeline.viewpoints.choosing import SIZE
-from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
+from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct, tell_time
 from lexsplat.reconstruction.block_training import BlockRun, reconstruct_blocks
 from lexsplat.reconstruction.blocks import number_of_blocks
 from lexsplat.rendering.backends import require_gsplat
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import choose_device, choose_encoder_device
-from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetError, ModelError
+from lexsplat.runtime.errors import (
+    CaptureError,
+    FileFormatError,
+    MemoryBudgetError,
+    ModelError,
+)
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.memory import parse_bytes
@@ -123,7 +130,7 @@ def build(
             sizes = [view.capture_size for view in capture.views.values()]
             config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
             capture = capture.downscaled(config.downscale or 1.0)
-            _check_photos(capture, parse_bytes(config.memory))
+            check_photos(capture, parse_bytes(config.memory))
             check_given_maps(config, capture)
             builder = _Builder(capture, folder, config, device, listener, splats)
             builder.encoders, builder.workers = checked, workers
@@ -315,12 +322,20 @@ class _Builder:
         config, seed, memory = self.config, self.config.seed, self.memory
         points = self._initial_points()
         check_gaussians(config.reconstruction, self.device, memory)
-        reconstructor = Reconstructor(
-            self.capture, config.reconstruction, points, device=self.device, seed=seed, memory=memory
-        )
+        options = {"device": self.device, "memory": memory}
         views = self._views_with_codes()
         code_maps, codebook = views.require_codes()
-        trainer = JointTrainer(reconstructor, views.cameras, code_maps, codebook, config.trained, seed=seed)
+        joined = partial(
+            JointTrainer,
+            cameras=views.cameras,
+            code_maps=code_maps,
+            codebook=codebook,
+            config=config.trained,
+            seed=seed,
+        )
+        start = (self.capture, config.reconstruction, points)
+        tell_time(*start, **options, listener=self.listener, joined=joined)
+        trainer = joined(Reconstructor(*start, **options, seed=seed))
         trainer.run(self.listener, self.checkpoint)
         gaussians, field = trainer.result()
         self.folder.write_gaussians(gaussians)
@@ -338,6 +353,7 @@ class _Builder:
     def _fit_codebook(self) -> dict[str, Any]:
         maps, names = self._feature_maps(), self.capture.train_names
         seed, memory, listener = self.config.seed, self.memory, self.listener
+        tell_codebook(maps, names, self.config.codebook)
         codebook = fit_codebook(
             maps, names, self.config.codebook, seed=seed, memory=memory, listener=listener
         )
@@ -420,24 +436,3 @@ class _Builder:
     def _code_paths(self) -> list[Path]:
         names = self.capture.train_names
         return [self.folder.codebook_path, *(self.folder.code_map_path(name) for name in names)]
-
-
-def _check_photos(capture: Capture, memory: int) -> None:
-    """Refuse photos that are too small, or too large for the memory budget, before any work.
-
-    Raises:
-        CaptureError: If a photo is too small at the size to work at.
-        MemoryBudgetError: If a photo does not fit.
-    """
-    from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
-
-    for view in capture.views.values():
-        width, height = view.camera.width, view.camera.height
-        if min(width, height) < SMALLEST_SIDE:
-            raise CaptureError(
-                view.image_path,
-                expected=f"at least {SMALLEST_SIDE} pixels a side to work on",
-                found=f"{width}x{height}",
-                remedy="give a smaller --downscale, or larger photos",
-            )
-        budget.check_photo((view.lens.width, view.lens.height), memory, (width, height))
