@@ -6,8 +6,8 @@
 Builds each capture in a folder of its own and compares what the build says before a stage with what the stage took
 by the clock. "ratio" is taken / told; the goal is 0.67 to 1.5. "-" is a stage whose time nothing tells. Times of a
 machine that does other work meanwhile differ by what that work takes: --processor compares processor seconds of one
-thread (with OMP_NUM_THREADS=1) in place of the clock, and then reading files costs nothing. SIFT features and matching of photos without
-cameras are told after their first units; they are timed from the first to the last event of progress.
+thread (with OMP_NUM_THREADS=1) in place of the clock; then reading files costs nothing. SIFT features and matching of
+photos without cameras are told after their first units; they are timed from the first to the last event of progress.
 """
 
 from __future__ import annotations
@@ -125,7 +125,9 @@ def main() -> None:
                 f" {row['taken_seconds']:6.1f} s {'-' if ratio is None else f'{ratio:.2f}':>6}",
                 flush=True,
             )
-    write_record(options.json, rows, iterations=options.iterations, method=options.method, processor=options.processor)
+    write_record(
+        options.json, rows, iterations=options.iterations, method=options.method, processor=options.processor
+    )
     wrong = [row for row in rows if row["ratio"] and not 1 / LIMIT <= row["ratio"] <= LIMIT]
     if wrong:
         print(f"{len(wrong)} of {len(rows)} stages are outside {1 / LIMIT:.2f} to {LIMIT}", file=sys.stderr)

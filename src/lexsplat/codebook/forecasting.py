@@ -70,9 +70,8 @@ def forecast(feature_maps: Mapping[str, FeatureMap], names: Sequence[str], confi
     else:
         some = torch.arange(config.num_codes) % len(clip)
         code_clip, code_dino, clusters = clip[some], None if dino is None else dino[some], 0.0
-    codes = [code for code in (code_clip, code_dino) if code is not None]
     _, steps = _timed(lambda: refine(clip, dino, code_clip, code_dino, few, generator))
-    codebook = Codebook(*codes, lambda_dino=config.lambda_dino)
+    codebook = Codebook(code_clip, code_dino, config.lambda_dino)
     _, maps = _timed(lambda: [codebook.assign(feature_maps[name]) for name in assigned])
     return (
         reading / len(sampled) * len(names)

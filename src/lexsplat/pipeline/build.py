@@ -54,7 +54,7 @@ from lexsplat.runtime.errors import (
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.memory import parse_bytes
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Event, Listener, silent, uncounted
 from lexsplat.runtime.training import Checkpoint
 from lexsplat.runtime.workers import IN_PROCESS, SharedFolder, Workers, open_workers
 from lexsplat.scenes.folder import SceneFolder
@@ -313,8 +313,9 @@ class _Builder:
 
     def _take_splats(self) -> dict[str, Any]:
         splats = existing_splats(self.splats)
-        gaussians = splats_of_capture(splats, self.capture, self.folder)
-        check_agreement(gaussians, list(self._training_views.values()), splats)
+        with uncounted(self.listener, "splats"):
+            gaussians = splats_of_capture(splats, self.capture, self.folder)
+            check_agreement(gaussians, list(self._training_views.values()), splats)
         self.folder.write_gaussians(gaussians)
         return {"gaussians": len(gaussians), "splats": str(splats.resolve())}
 
@@ -322,7 +323,7 @@ class _Builder:
         config, seed, memory = self.config, self.config.seed, self.memory
         points = self._initial_points()
         check_gaussians(config.reconstruction, self.device, memory)
-        options = {"device": self.device, "memory": memory}
+        options: dict[str, Any] = {"device": self.device, "memory": memory}
         views = self._views_with_codes()
         code_maps, codebook = views.require_codes()
         joined = partial(
