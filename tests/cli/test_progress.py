@@ -109,7 +109,7 @@ def test_work_that_cannot_be_counted_states_the_time_so_far(clock, monkeypatch, 
         bars(Event("export", 1, 1))
         bars(Event("views", 1, 1))
     lines = capsys.readouterr().err.splitlines()
-    assert lines == ["export: 0:02 so far", "export: done in 0:07", "views: 1/1"]
+    assert lines == ["export: 0:02 so far", "export: took 0:07", "views: 1/1"]
     screen = io.StringIO()
     monkeypatch.setattr(
         progress, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120, _environ={})

@@ -115,7 +115,7 @@ class ProgressBars:
         if event.total == 1 and not event.done:
             line = f"{format_seconds(now - self._began.setdefault(name, now))} so far"
         elif event.total == 1 and name in self._began:
-            line = f"done in {format_seconds(now - self._began.pop(name))}"
+            line = f"took {format_seconds(now - self._began.pop(name))}"
         else:
             line = self._counted(event, name, now, rate)
         if line:

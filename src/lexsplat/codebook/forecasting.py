@@ -15,7 +15,7 @@ from lexsplat.codebook.settings import CodebookConfig
 from lexsplat.codebook.space import Codebook
 from lexsplat.runtime.device import one_thread
 from lexsplat.runtime.errors import TrainingError
-from lexsplat.runtime.progress import tell
+from lexsplat.runtime.progress import Listener, silent, tell, uncounted
 from lexsplat.runtime.sampling import evenly
 
 if TYPE_CHECKING:
@@ -30,11 +30,16 @@ T = TypeVar("T")
 
 
 def tell_codebook(
-    feature_maps: Mapping[str, FeatureMap], names: Sequence[str], config: CodebookConfig
+    feature_maps: Mapping[str, FeatureMap],
+    names: Sequence[str],
+    config: CodebookConfig,
+    listener: Listener = silent,
 ) -> None:
-    """Log how long the codebook will take (`forecast`, whose arguments these are)."""
+    """Log how long the codebook will take (`forecast`); the listener receives events of stage "calibrate"."""
     with contextlib.suppress(ValueError, TrainingError):  # features that the fit refuses
-        tell("codebook", forecast(feature_maps, names, config), f"{len(names):,} views")
+        with uncounted(listener, "calibrate"):
+            seconds = forecast(feature_maps, names, config)
+        tell("codebook", seconds, f"{len(names):,} views")
 
 
 @one_thread()

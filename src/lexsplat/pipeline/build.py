@@ -354,7 +354,7 @@ class _Builder:
     def _fit_codebook(self) -> dict[str, Any]:
         maps, names = self._feature_maps(), self.capture.train_names
         seed, memory, listener = self.config.seed, self.memory, self.listener
-        tell_codebook(maps, names, self.config.codebook)
+        tell_codebook(maps, names, self.config.codebook, listener)
         codebook = fit_codebook(
             maps, names, self.config.codebook, seed=seed, memory=memory, listener=listener
         )

@@ -118,9 +118,7 @@ def run_training(
                 listener(Event(stage, done, total, training.metrics))
 
 
-def time_steps(
-    training: Training, untimed: int, steps: int, listener: Callable[[int], None] = lambda done: None
-) -> float:
+def time_steps(training: Training, untimed: int, steps: int, listener: Callable[[int], None]) -> float:
     """Seconds of one step of a training, which is lost afterwards.
 
     Args:

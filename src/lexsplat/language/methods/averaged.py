@@ -37,7 +37,7 @@ from lexsplat.language.methods.method import FitRun, TrainingViews, Variant
 from lexsplat.language.segments import make_segments
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import one_thread
-from lexsplat.runtime.progress import Listener, silent, tell
+from lexsplat.runtime.progress import Event, Listener, silent, tell
 from lexsplat.runtime.sampling import evenly
 
 _TOLD_FROM = 12
@@ -146,25 +146,31 @@ def _forecast(gaussians: Gaussians, views: TrainingViews, config: Any, run: FitR
 
     The first of two runs of each part is not timed: it loads kernels.
     """
-    run, count = replace(run, listener=silent), len(gaussians)
+    count, listener = len(gaussians), run.listener
+    run = replace(run, listener=silent)
+    listener(Event("calibrate", 0, 4))
     first, *others = evenly(sorted(views.cameras.items()), 1 + _VIEWS)
     _means(gaussians, views, dict([first]), config, run)
+    listener(Event("calibrate", 1, 4))
     start = time.perf_counter()
     found = _means(gaussians, views, dict(others), config, run)
     averaging = (time.perf_counter() - start) / len(others) * len(views.views)
     shown = found.visible(config.averaged).nonzero()[:, 0].cpu()
     chosen = torch.tensor(evenly(shown.tolist(), _SAMPLE), dtype=torch.int64)
     if not len(chosen):
+        listener(Event("calibrate", 4, 4))
         return averaging
     part = MeanFeatures(found.means[chosen.numpy()], found.totals[chosen.to(found.totals.device)], found.dino)
     share = len(chosen) / count
     codebook = replace(config.codebook, sample_size=max(1, round(config.codebook.sample_size * share)))
     sample = gaussians.select(chosen.to(gaussians.device))
     seconds = 0.0
-    for _ in range(2):
+    for done in (2, 3):
+        listener(Event("calibrate", done, 4))
         start = time.perf_counter()
         _with_language(sample, part, codebook, config.averaged, run)
         seconds = time.perf_counter() - start
+    listener(Event("calibrate", 4, 4))
     return averaging + seconds / share
 
 

@@ -18,7 +18,7 @@ from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.rendering import PreparedView, prepare
 from lexsplat.runtime.memory import DEFAULT_MEMORY
-from lexsplat.runtime.progress import Listener, silent, tell
+from lexsplat.runtime.progress import Event, Listener, silent, tell
 from lexsplat.runtime.sampling import evenly
 from lexsplat.runtime.training import run_training, time_steps
 
@@ -110,7 +110,12 @@ def train_field(
         calibrated = FieldTrainer(gaussians, codebook, config, seed=seed)
         views = _prepare_views(calibrated.gaussians, some, config, memory)
         training = _FrozenGeometryTraining(calibrated, views, code_maps)
-        seconds = config.iterations * time_steps(training, _FIRST, _STEPS)
+
+        def report(done: int) -> None:
+            listener(Event("calibrate", done, _FIRST + _STEPS))
+
+        report(0)
+        seconds = config.iterations * time_steps(training, _FIRST, _STEPS, report)
         tell("language", seconds, f"{config.iterations:,} iterations")
     trainer = FieldTrainer(gaussians, codebook, config, seed=seed)
     views = _prepare_views(trainer.gaussians, cameras, config, memory)
