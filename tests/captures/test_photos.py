@@ -59,6 +59,17 @@ def test_progress_counts_the_pairs_of_photos(room):
     assert (counts[0], counts[-1]) == (0, 45)
 
 
+@pytest.mark.parametrize(("mapper", "shown"), [("global", [0, 1]), ("incremental", [])])
+def test_the_global_mapper_which_reports_nothing_is_shown_while_it_runs(mapper, shown, monkeypatch):
+    events = []
+    monkeypatch.setattr(mapping, "map_photos", lambda *_: None)
+    found = photos._attempt(
+        Path("a.db"), SimpleNamespace(names=("a", "b")), mapper, 0, events.append, all_pairs=False
+    )
+    assert found is None
+    assert [(event.stage, event.done) for event in events] == [("global mapper", done) for done in shown]
+
+
 @pytest.mark.parametrize(("pairs", "number"), [("exhaustive", 45), ("sequential", 25)])
 def test_the_number_of_pairs_is_the_one_that_pycolmap_matches(pairs, number, room, tmp_path, monkeypatch):
     folder, _, _ = room

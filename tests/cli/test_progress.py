@@ -102,6 +102,26 @@ def test_the_rate_of_a_stage_leaves_out_the_time_since_an_earlier_scene_was_kept
     assert pace.rate(Event("reconstruct", 20, 100)) == pytest.approx(1.0)
 
 
+def test_work_that_cannot_be_counted_states_the_time_so_far(clock, monkeypatch, capsys):
+    with ProgressBars({"export": 98.0}) as bars:  # it began two seconds ago
+        bars(Event("export", 0, 1))
+        clock[0] += 5
+        bars(Event("export", 1, 1))
+        bars(Event("views", 1, 1))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["export: 0:02 so far", "export: took 0:07", "views: 1/1"]
+    screen = io.StringIO()
+    monkeypatch.setattr(
+        progress, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120, _environ={})
+    )
+    with ProgressBars({"export": 98.0}) as bars:
+        bars(Event("export", 0, 1))
+        assert bars._progress.tasks[0].total is None
+        assert bars._progress.tasks[0].start_time == 98.0
+        bars(Event("export", 1, 1))
+        assert bars._progress.tasks[0].finished
+
+
 def test_what_ray_prints_is_not_among_the_lines_of_json(capsys):
     with progress.shown_progress("json") as listener:
         listener(Event("blocks", 1, 4))

@@ -2,6 +2,7 @@
 
 import time
 
+from lexsplat.cli import waiting
 from lexsplat.cli.waiting import LateProgress
 from lexsplat.runtime.progress import Event
 
@@ -63,3 +64,16 @@ def test_a_stage_that_failed_does_not_show_its_next_run_too_early(capsys, monkey
     listener(Event("words", 1, 2))
     listener(Event("words", 2, 2))
     assert capsys.readouterr().err == ""
+
+
+def test_imports_that_take_long_are_shown_with_the_time_so_far_and_quick_ones_are_not(capsys, monkeypatch):
+    with waiting.starting():
+        pass
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(waiting, "LateProgress", lambda: LateProgress(patience=0.05))
+    deadline = time.monotonic() + 20
+    with waiting.starting():
+        while "start: 0:0" not in (said := capsys.readouterr().err) and time.monotonic() < deadline:
+            time.sleep(0.02)
+    assert "so far" in said
+    assert "start: took 0:0" in capsys.readouterr().err

@@ -42,8 +42,11 @@ def test_many_floaters_are_left_out_with_a_warning_and_few_lonely_gaussians_stay
     clean, dust = dusty()
     distances = np.linalg.norm(dust.means.numpy()[:, None] - on_table()[None, ::10], axis=2).min(1)
     both = joined(clean, dust)
+    events = []
     with caplog.at_level(logging.WARNING, "lexsplat"):
-        floating = find_floaters(both, Path("dusty.ply"))
+        floating = find_floaters(both, Path("dusty.ply"), listener=events.append)
+    assert {event.stage for event in events} == {"floaters"}
+    assert max(event.done for event in events) == max(event.total for event in events) - 1
     assert "dusty.ply" in caplog.text
     assert "float free of all surfaces" in caplog.text
     assert (floating >= len(clean)).all()

@@ -301,7 +301,7 @@ def test_a_build_of_splats_alone_keeps_its_views_and_repeats_no_choice(tmp_path)
     config = BuildConfig(clip="bundled", dino="none", device="cpu", up="0,0,1")
     events, told = [], []
     folder = build(None, output, config, until="reconstruct", splats=splats, listener=told.append)
-    for name in ("views", "comparison", "pictures"):
+    for name in ("floaters", "surroundings", "views", "comparison", "pictures"):
         shares = [event.done / event.total for event in told if event.stage == name]
         assert shares == sorted(shares)
         assert shares[-1] == 1

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from lexsplat.rendering import render
+from lexsplat.runtime.progress import Event
 
 BENCHMARKS = [
     script
@@ -111,13 +112,32 @@ def test_told_times_are_read_from_what_a_build_says(monkeypatch):
     for message in (
         "reconstruct: about 2:05 min for 2,250 iterations",
         f"features on cpu: {Estimate(1176, 90.0).describe(100)}",
+        "language: about 0:08 min for 60 views and 39,989 Gaussians",
+        "SIFT features: about 1:00:02 hours for 5,000 photos",
         "workers: 2 nodes, 4 cores",
     ):
         notes.emit(logging.LogRecord("lexsplat", 25, "", 0, message, (), None))
-    assert notes.told == {"reconstruct": 125.0, "features": 9000.0}
+    expected = {"reconstruct": 125.0, "features": 9000.0, "language": 8.0, "SIFT features": 3602.0}
+    assert notes.told == expected
     notes.emit(
         logging.LogRecord(
             "lexsplat", 25, "", 0, f"features on cpu: {Estimate(12, 1.2).describe(50)}", (), None
         )
     )
     assert notes.told["features"] == 60.0
+
+
+def test_the_parts_of_structure_from_motion_are_timed_by_their_events(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import forecasts
+
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    clock = forecasts.PosesClock()
+    for at, stage, done, total in (
+        (0, "poses", 0, 21), (20, "poses", 10, 21), (21, "matching", 0, 45), (60, "matching", 45, 45),
+        (61, "poses", 11, 21), (90, "poses", 21, 21),
+    ):  # fmt: skip
+        now[0] = float(at)
+        clock(Event(stage, done, total))
+    assert clock.taken == {"SIFT features": 21.0, "matching": 39.0}

@@ -1,10 +1,12 @@
 """The forecast of a reconstruction. No time is measured: the clock counts Gaussians and pixels."""
 
+import numpy as np
 import pytest
 import torch
 
-from lexsplat.captures import initial_points, load_capture
+from lexsplat.captures import InitialPoints, initial_points, load_capture
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor, forecasting
+from lexsplat.runtime.progress import NOTE
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -44,3 +46,28 @@ def test_the_number_of_gaussians_grows_by_rounds_up_to_the_limit():
     assert counts[-1] == 40_000
     assert (counts[1:] >= counts[:-1]).all()
     assert forecasting._counts(ReconstructionConfig(iterations=100), 50_000, 40_000).max() == 40_000
+
+
+def test_what_is_trained_beside_a_reconstruction_counts(monkeypatch, caplog):
+    clock, device = [0.0], torch.device("cpu")
+    points = InitialPoints(np.random.default_rng(0).random((60, 3)), np.ones((60, 3)), "capture", "")
+
+    class Beside:
+        """A step of both takes three seconds, the first of each trainer longer."""
+
+        def __init__(self, reconstructor):
+            assert reconstructor is made[-1]
+            self.device, self.steps = device, 0
+
+        def step(self):
+            self.steps += 1
+            clock[0] += 100.0 if self.steps <= 2 else 3.0
+
+    made = []
+    monkeypatch.setattr(forecasting, "Reconstructor", lambda *_, **__: made.append(object()) or made[-1])
+    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
+    for iterations in (499, 500):
+        config = ReconstructionConfig(iterations=iterations)
+        with caplog.at_level(NOTE, "lexsplat"):
+            forecasting.tell_time(None, config, points, memory=1 << 30, joined=Beside)
+    assert caplog.messages == ["reconstruct: about 25:00 min for 500 iterations"]

@@ -62,15 +62,16 @@ def test_a_saved_state_comes_back_exactly(tmp_path):
     assert torch.equal(first.value, second.value)
 
 
-def test_the_loop_sends_events_at_multiples_and_at_the_end():
+def test_the_loop_sends_events_at_the_start_at_multiples_and_at_the_end():
     events = []
     run_training(Counter(), stage="count", name="counter", every=10, listener=events.append)
     assert [(event.stage, event.done, event.total) for event in events] == [
+        ("count", 0, 25),
         ("count", 10, 25),
         ("count", 20, 25),
         ("count", 25, 25),
     ]
-    assert [event.metrics for event in events] == [{"value": 10.0}, {"value": 20.0}, {"value": 25.0}]
+    assert [event.metrics for event in events] == [{}, {"value": 10.0}, {"value": 20.0}, {"value": 25.0}]
 
 
 def test_an_interrupted_loop_continues_where_it_stopped(tmp_path):

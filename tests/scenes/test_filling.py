@@ -74,8 +74,10 @@ def test_a_deleted_thing_leaves_a_closed_surface_with_the_colors_around(turned):
 
 def test_nothing_is_filled_where_a_thing_stands_on_nothing_or_a_fill_is_not_wanted():
     hanging, world = table_with_a_ball(ball_height=2.0)
-    fill, gone = fill_for(ball_of(hanging, world))
+    events = []
+    fill, gone = fill_for(ball_of(hanging, world), listener=events.append)
     assert fill is None
+    assert [(event.stage, event.done, event.total) for event in events] == [("fill", 0, 1), ("fill", 1, 1)]
     assert torch.equal(gone, ball_of(hanging, world).mask)
     scene, world = table_with_a_ball()
     editor = Editor(scene)

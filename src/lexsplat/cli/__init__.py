@@ -17,7 +17,6 @@ from typing import NamedTuple, NoReturn
 
 from lexsplat import __version__
 from lexsplat.runtime.errors import STOPPED, LexsplatError
-from lexsplat.runtime.lazy import without_collection
 from lexsplat.runtime.progress import NOTE
 
 
@@ -125,8 +124,10 @@ def _run(words: list[str]) -> int:
     name = ALIASES.get(name, name)
     if name not in COMMANDS:
         _refuse(name)
+    from lexsplat.cli.waiting import starting
+
     entry = COMMANDS[name]
-    with without_collection():
+    with starting():
         from lexsplat.cli.arguments import parse
 
         kind = getattr(importlib.import_module(f"lexsplat.cli.{entry.module}"), entry.name)

@@ -9,6 +9,7 @@ from typing import Annotated, ClassVar
 import tyro
 
 from lexsplat.cli.options import Device, SceneArgument, note_hidden_demo
+from lexsplat.cli.waiting import LateProgress, starting
 
 Phrases = tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="PHRASE ...")]]
 
@@ -44,9 +45,9 @@ class Ask:
 
     def run(self) -> None:
         """Answer."""
-        from lexsplat.cli.waiting import LateProgress
-        from lexsplat.scenes.answers import find_phrase
-        from lexsplat.scenes.serving import OpenScene, answer_line, json_line, lines_of, sentence
+        with starting():
+            from lexsplat.scenes.answers import find_phrase
+            from lexsplat.scenes.serving import OpenScene, answer_line, json_line, lines_of, sentence
 
         note_hidden_demo(self.scene)
         # Where a terminal has other letters, "\\u1f34e" stands for an apple; lone surrogates stay valid JSON.

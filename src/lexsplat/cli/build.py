@@ -12,6 +12,7 @@ from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.options import CaptureArgument, MoreCapturesArgument, OptionalCaptureArgument, ProgressName
 from lexsplat.cli.settings import Settings
+from lexsplat.cli.waiting import starting
 from lexsplat.language.methods import METHODS
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import CaptureError
@@ -72,8 +73,9 @@ class Build:
 
     def run(self) -> None:
         """Build up to the last stage of this command."""
-        from lexsplat.cli.progress import shown_progress
-        from lexsplat.pipeline.build import build
+        with starting():
+            from lexsplat.cli.progress import shown_progress
+            from lexsplat.pipeline.build import build
 
         if self.more:
             self._build_scenes()

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from lexsplat.cli.options import Device, print_evaluation
+from lexsplat.cli.waiting import starting
 from lexsplat.language.methods import MethodName
 from lexsplat.pipeline.config import BuildConfig
 
@@ -43,8 +44,9 @@ class Demo:
 
     def run(self) -> None:
         """Build, evaluate and print the table."""
-        from lexsplat.cli.progress import ProgressBars
-        from lexsplat.evaluation.demo import run_demo
+        with starting():
+            from lexsplat.cli.progress import ProgressBars
+            from lexsplat.evaluation.demo import run_demo
 
         with ProgressBars() as bars:
             result = run_demo(

@@ -12,7 +12,9 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from lexsplat.cli.options import Device, SceneArgument, check_threshold, confirmed, open_scene
 from lexsplat.cli.values import Color
+from lexsplat.cli.waiting import starting
 from lexsplat.runtime.errors import QueryError
+from lexsplat.runtime.progress import uncounted
 
 if TYPE_CHECKING:
     from lexsplat.scenes.editing import Editor
@@ -115,9 +117,10 @@ class Edit:
 
     def run(self) -> None:
         """Do one action and print the steps and the size of the edited scene."""
-        from lexsplat.scenes.editing import Editor
-        from lexsplat.scenes.journal import journal_of
-        from lexsplat.scenes.previous import require_current
+        with starting():
+            from lexsplat.scenes.editing import Editor
+            from lexsplat.scenes.journal import journal_of
+            from lexsplat.scenes.previous import require_current
 
         scene = open_scene(self.scene, self.device, self.clip)
         if scene.folder is not None:
@@ -125,11 +128,13 @@ class Edit:
         journal = journal_of(scene)
         if self.action == "discard":
             self._discard(journal)
-        editor = Editor(scene, journal)
+        with uncounted(scene.listener, "steps"):
+            editor = Editor(scene, journal)
         if self.action in ("undo", "redo") and not getattr(editor, self.action)():
             print(f"nothing to {self.action}")
         elif self.action == "save" and self.output:
-            saved = editor.save(self.output).root
+            with uncounted(scene.listener, "save"):
+                saved = editor.save(self.output).root
             print(f"{saved}: written; the steps stay in {journal} until you discard them")
         elif self.action in CHANGES:
             self._change(editor)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import tyro
 
 from lexsplat.cli.options import Device, print_json
-from lexsplat.cli.waiting import LateProgress
+from lexsplat.cli.waiting import LateProgress, starting
 from lexsplat.features.encoders import DEFAULT_CLIP
 from lexsplat.runtime.progress import Event
 
@@ -47,13 +47,14 @@ class EncodersCommand:
         Raises:
             ModelError: If an encoder is not usable.
         """
-        from lexsplat.features.checks import check_dense, check_words
-        from lexsplat.features.estimate import estimate
-        from lexsplat.features.hub import model_folder
-        from lexsplat.pipeline.config import BuildConfig
-        from lexsplat.pipeline.encoding import Encoders
-        from lexsplat.pipeline.inputs import count_photos
-        from lexsplat.runtime.device import choose_device
+        with starting():
+            from lexsplat.features.checks import check_dense, check_words
+            from lexsplat.features.estimate import estimate
+            from lexsplat.features.hub import model_folder
+            from lexsplat.pipeline.config import BuildConfig
+            from lexsplat.pipeline.encoding import Encoders
+            from lexsplat.pipeline.inputs import count_photos
+            from lexsplat.runtime.device import choose_device
 
         photos, size = _PHOTOS, _SIZE
         config = BuildConfig(

@@ -16,6 +16,7 @@ from lexsplat.cli.options import (
     print_evaluation,
     print_json,
 )
+from lexsplat.cli.waiting import starting
 
 
 @dataclasses.dataclass
@@ -54,8 +55,9 @@ class Evaluate:
 
     def run(self) -> None:
         """Evaluate and print the table."""
-        from lexsplat.cli.progress import ProgressBars
-        from lexsplat.evaluation.scenes import evaluate_scene
+        with starting():
+            from lexsplat.cli.progress import ProgressBars
+            from lexsplat.evaluation.scenes import evaluate_scene
 
         scene = open_scene(self.scene, self.device, self.clip)
         if self.form:

@@ -15,7 +15,9 @@ from lexsplat.cli.options import (
     open_folder,
     open_scene,
 )
+from lexsplat.cli.waiting import LateProgress, starting
 from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.progress import uncounted
 
 
 @dataclasses.dataclass
@@ -55,8 +57,9 @@ class Export:
 
     def run(self) -> None:
         """Write the file."""
-        from lexsplat.geometry.world import world_of
-        from lexsplat.scenes.exporting import ending_of, export_gaussians, export_scene
+        with starting():
+            from lexsplat.geometry.world import world_of
+            from lexsplat.scenes.exporting import ending_of, export_gaussians, export_scene
 
         ending_of(self.file)
         folder = open_folder(self.scene)
@@ -71,11 +74,13 @@ class Export:
             ]
             for selection in found:
                 print(f"{selection.phrase}: {len(selection):,} Gaussians{PRESENCE[selection.present]}")
-            files = export_scene(scene, self.file, found=found, language=self.language, overwrite=True)
+            with uncounted(scene.listener, "export"):
+                files = export_scene(scene, self.file, found=found, language=self.language, overwrite=True)
         else:
             cameras = {name: view.camera for name, view in folder.read_cameras().items()}
             world = world_of(folder.record, cameras)
-            files = export_gaussians(folder.read_gaussians(), self.file, world=world, overwrite=True)
+            with uncounted(LateProgress(), "export"):
+                files = export_gaussians(folder.read_gaussians(), self.file, world=world, overwrite=True)
         for file in files:  # an existing file was confirmed above
             print(f"{file}: {file.stat().st_size:,} bytes")
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import tyro
 
 from lexsplat.cli.options import Device, check_phrases, print_json
-from lexsplat.cli.waiting import LateProgress
+from lexsplat.cli.waiting import LateProgress, starting
 from lexsplat.runtime.errors import FileFormatError, LibraryError, ModelError, SceneFolderError
 from lexsplat.runtime.progress import Event
 
@@ -85,7 +85,8 @@ class LibraryCommand:
 
     def run(self) -> None:
         """Do it and print."""
-        from lexsplat.scenes.library import Library
+        with starting():
+            from lexsplat.scenes.library import Library
 
         mends = self.repair and (self.library / "scenes").is_dir()
         make = Library.create if self.action == "add" or mends else Library

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from lexsplat.cli.waiting import LateProgress
+from lexsplat.cli.waiting import LateProgress, starting
 from lexsplat.runtime.lazy import without_collection
+from lexsplat.runtime.progress import uncounted
 
 if TYPE_CHECKING:
     from lexsplat.scenes.folder import SceneFolder
@@ -52,18 +53,19 @@ PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probabl
 def open_scene(path: str, device: str, clip: str | None) -> Scene:
     """Open the scene of a command with its encoders."""
     note_hidden_demo(path)
-    with without_collection():
+    listener = LateProgress()
+    with uncounted(listener, "scene"), without_collection():
         from lexsplat.scenes import scene as search
 
         scene = search.open_scene(path, device=device, clip=clip)
-    scene.listener = LateProgress()
+    scene.listener = listener
     return scene
 
 
 def open_folder(path: str) -> SceneFolder:
     """Open the scene folder of a command that needs no encoder."""
     note_hidden_demo(path)
-    with without_collection():
+    with starting():
         from lexsplat.scenes.folder import SceneFolder
 
     return SceneFolder.open(Path(path))

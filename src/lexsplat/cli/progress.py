@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from types import TracebackType
 
@@ -23,7 +23,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from lexsplat.runtime.progress import Event, Listener, Pace
+from lexsplat.runtime.progress import Event, Listener, Pace, format_seconds
 
 _SECONDS_BETWEEN_LINES = 15.0
 _ENDS = ("finished", "failed")
@@ -44,21 +44,18 @@ def format_rate(per_second: float | None) -> str:
     return f"{per_second:.1f}/s" if per_second >= 1 else f"{1 / per_second:.1f} s each"
 
 
-def format_seconds(seconds: float) -> str:
-    """A duration as "1:02:03" or "2:03"."""
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
-
-
 class ProgressBars:
     """A listener (see `lexsplat.runtime.progress`) that shows stages with rate and time left on standard error.
 
     Use it as a context manager, and call the instance with events.
+
+    Args:
+        began: When stages began that are under way, by the monotonic clock.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, began: Mapping[str, float] | None = None) -> None:
         self.console = Console(stderr=True)
+        self._began = dict(began or {})
         self._tasks: dict[str, TaskID] = {}
         self._pace = Pace()
         self._last_line: dict[str, float] = {}
@@ -100,28 +97,41 @@ class ProgressBars:
                 self._progress.remove_task(self._tasks.pop(event.scene))
             return
         key, title = (event.scene, f"{event.scene}: {event.stage}") if event.scene else (event.stage,) * 2
+        total = event.total if event.total > 1 or event.done else None  # None draws a pulse
         if key not in self._tasks:
-            self._tasks[key] = self._progress.add_task(title, total=event.total, metrics="")
+            self._tasks[key] = self._progress.add_task(title, total=total, metrics="")
         task = next(task for task in self._progress.tasks if task.id == self._tasks[key])
         if (
             event.done < task.completed or task.description != title
         ):  # the stage starts anew, or the next one does
             self._progress.reset(task.id, description=title)
-        self._progress.update(task.id, completed=event.done, total=event.total, metrics=text)
+        if event.stage in self._began:
+            task.start_time = self._began.pop(event.stage)
+        self._progress.update(task.id, completed=event.done, total=total, metrics=text)
 
     def _print_line(self, event: Event, text: str) -> None:
         now, rate = time.monotonic(), self._pace.rate(event)
         name = f"{event.scene}: {event.stage}" if event.scene else event.stage
+        if event.total == 1 and not event.done:
+            line = f"{format_seconds(now - self._began.setdefault(name, now))} so far"
+        elif event.total == 1 and name in self._began:
+            line = f"took {format_seconds(now - self._began.pop(name))}"
+        else:
+            line = self._counted(event, name, now, rate)
+        if line:
+            self.console.print(f"{name}: {line} {text}".rstrip(), highlight=False, soft_wrap=True)
+
+    def _counted(self, event: Event, name: str, now: float, rate: float) -> str:
+        """Units, rate and time left; empty where the last line of the stage is recent."""
         is_first = name not in self._last_line
         is_due = now - self._last_line.get(name, 0.0) >= _SECONDS_BETWEEN_LINES
         if not (is_first or is_due or event.done >= event.total):
-            return
+            return ""
         self._last_line[name] = now
         speed = format_rate(rate)
         if rate and event.done < event.total:
             speed += f", {format_seconds((event.total - event.done) / rate)} left"
-        parts = (f"{name}: {event.done}/{event.total}", speed, text)
-        self.console.print(" ".join(part for part in parts if part), highlight=False, soft_wrap=True)
+        return f"{event.done}/{event.total} {speed}".rstrip()
 
 
 @contextmanager

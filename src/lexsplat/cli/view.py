@@ -7,6 +7,8 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from lexsplat.cli.options import Device, SceneArgument, open_scene
+from lexsplat.cli.waiting import starting
+from lexsplat.runtime.progress import uncounted
 
 if TYPE_CHECKING:
     from lexsplat.viewer.server import ViewerConfig
@@ -48,10 +50,12 @@ class View:
 
     def run(self) -> None:
         """Serve until Ctrl-C."""
-        from lexsplat.viewer.server import ViewerServer
+        with starting():
+            from lexsplat.viewer.server import ViewerServer
 
         scene = open_scene(self.scene, self.device, self.clip)
-        viewer = ViewerServer(scene, self._config())
+        with uncounted(scene.listener, "page"):
+            viewer = ViewerServer(scene, self._config())
         print(f"{self.scene} is shown at {viewer.url} (Ctrl-C stops the server)", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             wait_for_interrupt()

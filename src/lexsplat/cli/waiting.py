@@ -5,9 +5,12 @@ from __future__ import annotations
 import atexit
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from lexsplat.runtime.progress import Event
+from lexsplat.runtime.lazy import without_collection
+from lexsplat.runtime.progress import Event, uncounted
 
 if TYPE_CHECKING:
     from lexsplat.cli.progress import ProgressBars
@@ -60,7 +63,7 @@ class LateProgress:
 
         with self._lock:
             if self._starts and self._bars is None:
-                self._bars = ProgressBars().__enter__()
+                self._bars = ProgressBars(self._starts).__enter__()
                 for stage in self._starts:
                     self._bars(self._latest[stage])
 
@@ -72,3 +75,10 @@ class LateProgress:
             if self._bars is not None:
                 self._bars.__exit__(None, None, None)
                 self._bars = None
+
+
+@contextmanager
+def starting() -> Iterator[None]:
+    """Import in this block what a command needs; the time so far is shown after two seconds."""
+    with uncounted(LateProgress(), "start"), without_collection():
+        yield

@@ -9,6 +9,7 @@ Equations are numbered 1 to 15 through the main text of the paper; supplement A 
 
 from lexsplat.codebook.assignment import assign_code_maps, code_usage
 from lexsplat.codebook.fitting import fit_codebook, mean_cosine, sample_features, spherical_kmeans
+from lexsplat.codebook.forecasting import tell_codebook
 from lexsplat.codebook.losses import load_balancing_loss, quantization_loss
 from lexsplat.codebook.settings import MAX_CODES, CodebookConfig
 from lexsplat.codebook.space import Codebook, similarity
@@ -26,4 +27,5 @@ __all__ = [
     "sample_features",
     "similarity",
     "spherical_kmeans",
+    "tell_codebook",
 ]

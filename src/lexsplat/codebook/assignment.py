@@ -27,6 +27,7 @@ def assign_code_maps(
     """An index map ``[h, w]`` uint8 for every named view (default: all), in one pass."""
     chosen = list(feature_maps if names is None else names)
     code_maps = {}
+    listener(Event("assign", 0, len(chosen)))
     for done, name in enumerate(chosen, start=1):
         code_maps[name] = codebook.assign(feature_maps[name])
         listener(Event("assign", done, len(chosen)))

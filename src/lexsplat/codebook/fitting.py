@@ -62,11 +62,12 @@ def fit_codebook(
     if not names:
         raise ValueError("a codebook needs at least one training view")
     generator = torch.Generator(device="cpu").manual_seed(seed)
+    total = config.steps + 1
+    listener(Event("codebook", 0, total))
     _check_sample(feature_maps[names[0]], len(names), config, memory)
     clip, dino = sample_features(feature_maps, names, config, generator=generator)
     clip, dino = clip.to(device), None if dino is None else dino.to(device)
     lambda_dino = config.lambda_dino
-    total = config.steps + 1
     if config.init == "kmeans":
         code_clip, code_dino = spherical_kmeans(
             clip,
@@ -81,7 +82,7 @@ def fit_codebook(
         code_clip = _uniform_codes(clip, config.num_codes, generator)
         code_dino = None if dino is None else _uniform_codes(dino, config.num_codes, generator)
     listener(Event("codebook", 1, total))
-    code_clip, code_dino = _refine(clip, dino, code_clip, code_dino, config, generator, listener)
+    code_clip, code_dino = refine(clip, dino, code_clip, code_dino, config, generator, listener)
     codebook = Codebook(
         functional.normalize(code_clip, dim=-1),
         None if code_dino is None else functional.normalize(code_dino, dim=-1),
@@ -205,9 +206,11 @@ def spherical_kmeans(
     """
     joint = clip if dino is None else torch.cat([clip, lambda_dino**0.5 * dino], dim=-1)
     split = clip.shape[1]
+    listener(Event("clusters", 0, iterations))
     centers = joint[_kmeans_seeds(joint, num_codes, generator)]
     for done in range(iterations):
-        listener(Event("clusters", done, iterations))
+        if done:
+            listener(Event("clusters", done, iterations))
         best, chosen = _nearest(joint, centers)
         sums = torch.zeros_like(centers).index_add_(0, chosen, joint)
         counts = torch.bincount(chosen, minlength=num_codes)
@@ -277,14 +280,14 @@ def _nearest(joint: Tensor, centers: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([part.values for part in parts]), torch.cat([part.indices for part in parts])
 
 
-def _refine(
+def refine(
     clip: Tensor,
     dino: Tensor | None,
     code_clip: Tensor,
     code_dino: Tensor | None,
     config: CodebookConfig,
     generator: torch.Generator,
-    listener: Listener,
+    listener: Listener = silent,
 ) -> tuple[Tensor, Tensor | None]:
     """Gradient steps on Eq. 7 over batches of the sample."""
     parameters = [

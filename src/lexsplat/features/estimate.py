@@ -15,6 +15,7 @@ from lexsplat.features.extraction import cpu_batch, encoded_size, parallel_views
 from lexsplat.features.pretrained import resize_images
 from lexsplat.features.pyramid import cut_crops, encode_stream, grid_levels, random_levels, unique_boxes
 from lexsplat.features.settings import FeatureConfig
+from lexsplat.runtime.progress import duration
 
 _SHORT = 0.5  # seconds below which a measurement is repeated with more crops
 _MOST_CROPS = 256
@@ -36,12 +37,7 @@ class Estimate:
     def describe(self, photos: int) -> str:
         """One line with the time of one photo and of several."""
         each = f"{self.seconds:.1f} s" if self.seconds < 60 else f"{self.seconds / 60:.1f} min"
-        minutes, seconds = divmod(round(self.seconds * photos), 60)
-        total = (
-            f"{minutes // 60}:{minutes % 60:02}:{seconds:02} hours"
-            if minutes >= 60
-            else f"{minutes}:{seconds:02} min"
-        )
+        total = duration(self.seconds * photos)
         return f"{self.crops:,} crops and about {each} a photo; {total} for {photos:,} training photos"
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from lexsplat.captures import Capture, View, load_annotations
-from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook
+from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook, tell_codebook
 from lexsplat.features import FeatureMaps
 from lexsplat.language.code_maps import MaskedCodeMaps, mark_masked_cells
 from lexsplat.language.methods import FitRun, TrainingViews
@@ -25,6 +25,7 @@ from lexsplat.pipeline.geometry import GeometryRun, way_to_geometry
 from lexsplat.pipeline.inputs import (
     PhotoSurvey,
     check_given_maps,
+    check_photos,
     prepare_capture,
     refuse_without_cameras,
     survey_photos,
@@ -36,7 +37,12 @@ from lexsplat.pipeline.viewpoints.choosing import SIZE
 from lexsplat.rendering.backends import require_gsplat
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import choose_device, choose_encoder_device
-from lexsplat.runtime.errors import CaptureError, FileFormatError, MemoryBudgetError, ModelError
+from lexsplat.runtime.errors import (
+    CaptureError,
+    FileFormatError,
+    MemoryBudgetError,
+    ModelError,
+)
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.progress import Event, Listener, silent
@@ -115,7 +121,7 @@ def build(
             sizes = [view.capture_size for view in capture.views.values()]
             config = config.resolved(device, max(sizes, key=lambda size: size[0] * size[1]))
             capture = capture.downscaled(config.downscale or 1.0)
-            _check_photos(capture, config.memory_bytes)
+            check_photos(capture, config.memory_bytes)
             check_given_maps(config, capture)
             builder = _Builder(capture, folder, config, device, listener, splats)
             builder.encoders, builder.workers = checked, workers
@@ -272,6 +278,7 @@ class _Builder:
     def _fit_codebook(self) -> dict[str, Any]:
         maps, names = self._feature_maps(), self.capture.train_names
         seed, memory = self.config.seed, self.config.memory_bytes
+        tell_codebook(maps, names, self.config.codebook, self.listener)
         codebook = fit_codebook(
             maps, names, self.config.codebook, seed=seed, memory=memory, listener=self.listener
         )
@@ -339,24 +346,3 @@ class _Builder:
     def _code_paths(self) -> list[Path]:
         names = self.capture.train_names
         return [self.folder.codebook_path, *(self.folder.code_map_path(name) for name in names)]
-
-
-def _check_photos(capture: Capture, memory: int) -> None:
-    """Refuse photos that are too small, or too large for the memory budget, before any work.
-
-    Raises:
-        CaptureError: If a photo is too small at the size to work at.
-        MemoryBudgetError: If a photo does not fit.
-    """
-    from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
-
-    for view in capture.views.values():
-        width, height = view.camera.width, view.camera.height
-        if min(width, height) < SMALLEST_SIDE:
-            raise CaptureError(
-                view.image_path,
-                expected=f"at least {SMALLEST_SIDE} pixels a side to work on",
-                found=f"{width}x{height}",
-                remedy="give a smaller --downscale, or larger photos",
-            )
-        budget.check_photo((view.lens.width, view.lens.height), memory, (width, height))

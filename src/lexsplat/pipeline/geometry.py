@@ -15,12 +15,14 @@ from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, parse_vector
 from lexsplat.language.methods import JOINT_METHODS, FitRun, JointMethod, TrainingViews
+from lexsplat.language.methods.joint import JointTrainer
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.splats import check_agreement, existing_splats, splats_hash
 from lexsplat.pipeline.viewpoints import splats_of_capture
-from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct
+from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct, tell_time
 from lexsplat.reconstruction.block_training import BlockRun, reconstruct_blocks
 from lexsplat.reconstruction.blocks import number_of_blocks
+from lexsplat.runtime.progress import uncounted
 from lexsplat.scenes.folder import SceneFolder
 
 
@@ -120,10 +122,15 @@ class _WithLanguage(Geometry):
     def make(self, config: BuildConfig, run: GeometryRun) -> tuple[Gaussians, dict[str, Any]]:
         points, memory = run.initial_points(), run.fit.memory
         check_gaussians(config.reconstruction, run.device, memory)
-        reconstructor = Reconstructor(
-            run.capture, config.reconstruction, points, device=run.device, seed=config.seed, memory=memory
-        )
-        training = self.method.joined(reconstructor, run.codes(), config, config.seed)
+        start = (run.capture, config.reconstruction, points)
+        options: dict[str, Any] = {"device": run.device, "memory": memory}
+        views = run.codes()
+
+        def joined(reconstructor: Reconstructor) -> JointTrainer:
+            return self.method.joined(reconstructor, views, config, config.seed)
+
+        tell_time(*start, **options, listener=run.fit.listener, joined=joined)
+        training = joined(Reconstructor(*start, **options, seed=config.seed))
         return self.method.fit_geometry(training, run.fit), {"joint": True}
 
 
@@ -138,8 +145,9 @@ class _Given(Geometry):
 
     def make(self, config: BuildConfig, run: GeometryRun) -> tuple[Gaussians, dict[str, Any]]:
         splats = existing_splats(self.path)
-        gaussians = splats_of_capture(splats, run.capture, run.folder)
-        check_agreement(gaussians, list(run.capture.train_views), splats)
+        with uncounted(run.fit.listener, "splats"):
+            gaussians = splats_of_capture(splats, run.capture, run.folder)
+            check_agreement(gaussians, list(run.capture.train_views), splats)
         return gaussians, {"splats": str(splats.resolve())}
 
 

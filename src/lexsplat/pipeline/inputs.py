@@ -39,6 +39,7 @@ from lexsplat.features import check_external_features
 from lexsplat.features.segments2d import check_segments
 from lexsplat.geometry.cameras import Camera
 from lexsplat.pipeline.config import BuildConfig
+from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError, SceneFolderError
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.progress import Listener
@@ -311,3 +312,24 @@ def reload_capture(folder: SceneFolder, source: Path | None = None) -> Capture:
             remedy="put them back or build again",
         )
     return found
+
+
+def check_photos(capture: Capture, memory: int) -> None:
+    """Refuse photos that are too small, or too large for the memory budget, before any work.
+
+    Raises:
+        CaptureError: If a photo is too small at the size to work at.
+        MemoryBudgetError: If a photo does not fit.
+    """
+    from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
+
+    for view in capture.views.values():
+        width, height = view.camera.width, view.camera.height
+        if min(width, height) < SMALLEST_SIDE:
+            raise CaptureError(
+                view.image_path,
+                expected=f"at least {SMALLEST_SIDE} pixels a side to work on",
+                found=f"{width}x{height}",
+                remedy="give a smaller --downscale, or larger photos",
+            )
+        budget.check_photo((view.lens.width, view.lens.height), memory, (width, height))

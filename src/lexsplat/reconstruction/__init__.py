@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,11 +9,11 @@ import torch
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.reconstruction.few_photos import has_few_photos, points_between, warn_of_few_photos
-from lexsplat.reconstruction.forecasting import forecast
+from lexsplat.reconstruction.forecasting import tell_time
 from lexsplat.reconstruction.settings import LONG_TRAINING, ReconstructionConfig
 from lexsplat.reconstruction.trainer import EVENT_EVERY, STAGE, Reconstructor
 from lexsplat.runtime import memory as budget
-from lexsplat.runtime.progress import NOTE, Listener, silent
+from lexsplat.runtime.progress import Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture
@@ -28,13 +27,8 @@ __all__ = [
     "Reconstructor",
     "check_gaussians",
     "reconstruct",
+    "tell_time",
 ]
-
-
-log = logging.getLogger("lexsplat")
-
-_FORECAST_FROM = 500
-"""Iterations from which the time is forecast; the calibration takes as long as about thirty of them."""
 
 
 # Eight parameters: two inputs, and the options that every stage takes.
@@ -74,10 +68,7 @@ def reconstruct(
     few = has_few_photos(capture)
     if few and points.origin != "random":
         points = points_between(capture, points, seed)
-    if config.iterations >= _FORECAST_FROM:
-        seconds = round(forecast(capture, config, points, device=device, memory=memory, listener=listener))
-        length = f"{seconds // 60}:{seconds % 60:02} min"
-        log.log(NOTE, "reconstruct: about %s for %s iterations", length, f"{config.iterations:,}")
+    tell_time(capture, config, points, device=device, memory=memory, listener=listener)
     trainer = Reconstructor(capture, config, points, device=device, seed=seed, memory=memory)
     trainer.run(listener, checkpoint)
     if few:

@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
-import itertools
-import time
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from lexsplat.reconstruction.settings import ReconstructionConfig
-from lexsplat.reconstruction.trainer import Reconstructor
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.reconstruction.trainer import STAGE, Reconstructor
+from lexsplat.runtime.progress import Event, Listener, silent, tell
+from lexsplat.runtime.training import Training, time_steps
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, InitialPoints
 
+_TOLD_FROM = 500
+"""Iterations from which the time is told; the calibration takes as long as about thirty of them."""
 _FIRST = 2
-"""Steps that are not timed: they read photos and load kernels."""
+"""Steps that are not timed."""
 _STEPS = 4
 _GROWTH = {"default": 1.45, "mcmc": 1.05}
 """Factor by which a round of density control multiplies the number of Gaussians; 1.4 to 1.55 on the bundled captures
 with "default", and by definition with "mcmc"."""
+
+
+def tell_time(capture: Capture, config: ReconstructionConfig, points: InitialPoints, **options: Any) -> None:
+    """Log how long a reconstruction will take (`forecast`, whose options these are); short ones are not told."""
+    if config.iterations >= _TOLD_FROM:
+        seconds = forecast(capture, config, points, **options)
+        tell(STAGE, seconds, f"{config.iterations:,} iterations")
 
 
 def forecast(
@@ -34,6 +43,7 @@ def forecast(
     device: torch.device | str = "cpu",
     memory: int,
     listener: Listener = silent,
+    joined: Callable[[Reconstructor], Training] = lambda reconstructor: reconstructor,
 ) -> float:
     """Seconds that a reconstruction will take.
 
@@ -47,6 +57,7 @@ def forecast(
         device: Where to train.
         memory: Budget of host memory in bytes.
         listener: Receives an event of stage "calibrate" after each untimed step and each timed row of steps.
+        joined: A training that runs the steps of a reconstruction together with those of something else.
     """
     counts = _counts(config, len(points.points), config.cap(torch.device(device)))
     grown = (counts - counts[0]) / max(1.0, counts[-1] - counts[0])
@@ -56,35 +67,28 @@ def forecast(
         (0.0, grown[config.warm_up_iterations :]),
     ]
     parts = [part for part in parts if len(part[1])]
-    done, steps = itertools.count(1), 2 * len(parts) * (_FIRST + _STEPS)
+    steps = 2 * len(parts) * (_FIRST + _STEPS)
     listener(Event("calibrate", 0, steps))
+    before = 0
 
     def per_step(start: InitialPoints, warm_up: float) -> float:
-        trainer = Reconstructor(
-            capture, replace(config, warm_up=warm_up), start, device=device, memory=memory
+        nonlocal before
+        settings = replace(config, warm_up=warm_up)
+        trainer = Reconstructor(capture, settings, start, device=device, memory=memory)
+        seconds = time_steps(
+            joined(trainer),
+            _FIRST,
+            _STEPS,
+            lambda done: listener(Event("calibrate", before + done, steps)),
         )
-        for _ in range(_FIRST):
-            trainer.step()
-            listener(Event("calibrate", next(done), steps))
-        _finish(trainer.device)
-        begin = time.perf_counter()
-        for _ in range(_STEPS):
-            trainer.step()
-        _finish(trainer.device)
-        seconds = time.perf_counter() - begin
-        listener(Event("calibrate", [next(done) for _ in range(_STEPS)][-1], steps))
-        return seconds / _STEPS
+        before += _FIRST + _STEPS
+        return seconds
 
     total = 0.0
     for warm_up, shares in parts:
         few, most = per_step(points, warm_up), per_step(many, warm_up)
         total += float((few + shares * (most - few)).sum())
     return total
-
-
-def _finish(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def _counts(config: ReconstructionConfig, start: int, cap: int) -> NDArray[np.float64]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +14,11 @@ NOTE = 25
 """Level of log records that every user of the command line sees and that are no warnings: licenses, estimates."""
 
 logging.addLevelName(NOTE, "note")
+
+log = logging.getLogger("lexsplat")
+
+_TOLD_FROM = 2.0
+"""Seconds from which the time of a stage is told."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +28,7 @@ class Event:
     Args:
         stage: Name of the stage, such as "reconstruct".
         done: Finished units.
-        total: All units.
+        total: All units; 1 for work that cannot be counted (`uncounted`).
         metrics: Numbers to show beside the bar, such as ``{"psnr": 31.2}``.
         scene: Name of the scene that the stage is of, where several are built.
     """
@@ -80,3 +86,62 @@ class Pace:
 
 def silent(event: Event) -> None:
     """A listener that ignores everything."""
+
+
+@contextmanager
+def uncounted(listener: Listener, stage: str) -> Iterator[None]:
+    """Send the events of a stage that cannot be counted: its begin, and its end after the block."""
+    listener(Event(stage, 0, 1))
+    try:
+        yield
+    finally:
+        listener(Event(stage, 1, 1))
+
+
+def format_seconds(seconds: float) -> str:
+    """A duration as "1:02:03" or "2:03"."""
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
+
+
+def duration(seconds: float) -> str:
+    """The same with its unit: "1:02:03 hours" or "2:03 min"."""
+    return f"{format_seconds(seconds)} {'hours' if round(seconds) >= 3600 else 'min'}"
+
+
+def tell(stage: str, seconds: float, amount: str) -> None:
+    """Log how long a stage will take, if it takes two seconds or more.
+
+    Args:
+        stage: Name of the stage.
+        seconds: The forecast.
+        amount: What it is for, such as "2,250 iterations".
+    """
+    if seconds >= _TOLD_FROM:
+        log.log(NOTE, "%s: about %s for %s", stage, duration(seconds), amount)
+
+
+class FirstUnits:
+    """Tells how long a stage will take, once its first units are done, where all units take about as long.
+
+    Args:
+        stage: Name of the stage.
+        units: What is counted, such as "photos".
+    """
+
+    _ENOUGH = 1.0
+    """Seconds that are measured, at least."""
+
+    def __init__(self, stage: str, units: str) -> None:
+        self._stage, self._units = stage, units
+        self._start, self._told = 0.0, False
+
+    def __call__(self, done: int, total: int) -> None:
+        """Receive the number of finished units, first 0; nothing is told from the middle on."""
+        if not done:
+            self._start, self._told = time.monotonic(), False
+        seconds = time.monotonic() - self._start
+        if seconds >= self._ENOUGH and 0 < done <= total / 2 and not self._told:
+            self._told = True
+            tell(self._stage, seconds / done * total, f"{total:,} {self._units}")

@@ -12,7 +12,7 @@ import logging
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Protocol
@@ -104,6 +104,7 @@ def run_training(
     if checkpoint is not None:
         checkpoint.resume(training)
     total = training.total_steps
+    listener(Event(stage, training.steps_done, total))
     guard = DivergenceGuard(training, name, every=KEEP_EVERY[training.device.type])
     with contextlib.nullcontext() if checkpoint is None else checkpoint.deferring_interrupts():
         while training.steps_done < total:
@@ -115,6 +116,33 @@ def run_training(
             done = training.steps_done
             if done % every == 0 or done == total:
                 listener(Event(stage, done, total, training.metrics))
+
+
+def time_steps(training: Training, untimed: int, steps: int, listener: Callable[[int], None]) -> float:
+    """Seconds of one step of a training, which is lost afterwards.
+
+    Args:
+        training: The training.
+        untimed: Steps before: they read photos and load kernels.
+        steps: Steps that are timed together.
+        listener: Receives the number of steps done: after each untimed step, and at the end.
+    """
+    for done in range(1, untimed + 1):
+        training.step()
+        listener(done)
+    _finish(training.device)
+    start = time.perf_counter()
+    for _ in range(steps):
+        training.step()
+    _finish(training.device)
+    seconds = time.perf_counter() - start
+    listener(untimed + steps)
+    return seconds / steps
+
+
+def _finish(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 class Checkpoint:

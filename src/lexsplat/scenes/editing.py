@@ -286,7 +286,7 @@ class Editor:
             )
         whole = self._whole(chosen, "fill" in values)
         if "fill" in values:
-            fill, mask = fill_for(whole, self._photographed_from())
+            fill, mask = fill_for(whole, self._photographed_from(), self.original.listener)
             values, whole = {} if fill is None else {"fill": fill.to_json()}, replace(whole, mask=mask)
         step = Step(kind, whole.mask.clone().cpu(), values, chosen.phrase)
         with self._change(step.to_json()):

@@ -29,6 +29,7 @@ from torch import Tensor
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.queries.selection import Selection
+from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.completing import completed
 from lexsplat.scenes.surfaces import (
     FEWEST,
@@ -145,18 +146,26 @@ def hidden_inside(chosen: Selection, hidden: Tensor) -> Tensor:
     return torch.from_numpy(inside).to(hidden.device) & hidden
 
 
-def fill_for(chosen: Selection, cameras: Sequence[Camera] = ()) -> tuple[Fill | None, Tensor]:
+def fill_for(
+    chosen: Selection, cameras: Sequence[Camera] = (), listener: Listener = silent
+) -> tuple[Fill | None, Tensor]:
     """The Gaussians that close the surfaces under a deleted selection, and those that are deleted with it.
 
     Args:
         chosen: The selection.
         cameras: The views that the scene was made from.
+        listener: Receives events of stage "fill", one unit a thing.
 
     Returns:
         The fill, None if there is nothing to fill, and the selection with the remains under its things ``[N]`` bool.
     """
     gone = chosen.mask.cpu().numpy().copy()
-    found = [fill for each in chosen.instances if (fill := _fill_below(each, gone, cameras)) is not None]
+    things, found = chosen.instances, list[Fill]()
+    for done, thing in enumerate(things):
+        listener(Event("fill", done, len(things)))
+        fill = _fill_below(thing, gone, cameras)
+        found += [] if fill is None else [fill]
+    listener(Event("fill", len(things), len(things)))
     mask = torch.from_numpy(gone).to(chosen.mask.device)
     if not found:
         return None, mask

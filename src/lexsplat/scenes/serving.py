@@ -14,7 +14,7 @@ from typing import Any, TextIO
 
 from lexsplat.queries.spelling import corrected
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
-from lexsplat.runtime.progress import Listener, silent
+from lexsplat.runtime.progress import Listener, silent, uncounted
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.scene import Scene, open_scene
@@ -48,7 +48,8 @@ class OpenScene:
         self._scene = self._open()
 
     def _open(self) -> Scene:
-        scene = open_scene(self.path, device=self._device, clip=self._clip)
+        with uncounted(self._listener, "scene"):
+            scene = open_scene(self.path, device=self._device, clip=self._clip)
         scene.listener = self._listener
         return scene
 

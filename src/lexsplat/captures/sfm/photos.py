@@ -23,7 +23,7 @@ from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import BackendError, CaptureError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import file_stamp, fingerprint
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Event, FirstUnits, Listener, silent, uncounted
 
 if TYPE_CHECKING:
     from lexsplat.captures.sfm.mapping import Attempt, Mapper
@@ -135,7 +135,8 @@ def poses_from_photos(
         seed: Seed for pycolmap.
         memory: Bytes of host memory available. Determines threads and batches, never the result.
         listener: Receives events of stage ``"poses"``: one unit per photo with features, one for matching, one per
-            registered photo; and of stage ``"matching"``, one unit per pair of photos.
+            registered photo; of stage ``"matching"``, one unit per pair of photos; and of stage ``"global mapper"``,
+            which cannot be counted. The time of features and matching is logged after their first units.
 
     Raises:
         CaptureError: If there are fewer than three photos, one is unreadable, or none can be registered.
@@ -152,18 +153,22 @@ def poses_from_photos(
     work = _work_folder(output, photos, config, seed)
     database = work / "database.db"
 
+    tell_features, tell_pairs = FirstUnits("SIFT features", "photos"), FirstUnits(MATCHING, "pairs")
+
     def report(done: int) -> None:
-        listener(Event(STAGE, min(done, total - 1), total))
+        _report(listener, photos, done)
+        tell_features(done, len(names))
 
     def report_pairs(done: int, pairs: int) -> None:
         listener(Event(MATCHING, done, pairs))
+        tell_pairs(done, pairs)
 
     with quiet_pycolmap(seed):
         report(0)
         mapping.extract_features(database, photos, config, memory, report)
         mapping.match_photos(database, len(names), config, seed, memory, report_pairs)
-        report(len(names) + 1)
-        best = _best_attempt(database, photos, config, seed, memory, report, report_pairs)
+        _report(listener, photos, len(names) + 1)
+        best = _best_attempt(database, photos, config, seed, memory, listener, report_pairs)
         if best is None:
             _discard(work, output)
             raise CaptureError(
@@ -198,7 +203,7 @@ def _best_attempt(
     config: PoseConfig,
     seed: int,
     memory: int,
-    report: Callable[[int], None],
+    listener: Listener,
     report_pairs: Callable[[int, int], None],
 ) -> Attempt | None:
     """The mapper that registers the most photos, with the least error on a tie.
@@ -219,13 +224,13 @@ def _best_attempt(
         ):
             continue
         check_mapping(database, memory)
-        found = _attempt(database, photos, mapper, seed, report, all_pairs=leftover)
+        found = _attempt(database, photos, mapper, seed, listener, all_pairs=leftover)
         missing = mapping.unregistered(names, found)
         if missing and not every_pair:
             every_pair = leftover = True
             mapping.match_leftover(database, names, missing, seed, memory, report_pairs)
             check_mapping(database, memory)
-            found = _attempt(database, photos, mapper, seed, report, all_pairs=True) or found
+            found = _attempt(database, photos, mapper, seed, listener, all_pairs=True) or found
         best = max(filter(None, (best, found)), key=lambda attempt: attempt.rank, default=None)
         if mapping.matched(database).isdisjoint(mapping.unregistered(names, best)):
             break
@@ -237,15 +242,22 @@ def _attempt(
     photos: PreparedPhotos,
     mapper: Mapper,
     seed: int,
-    report: Callable[[int], None],
+    listener: Listener,
     *,
     all_pairs: bool,
 ) -> Attempt | None:
     from lexsplat.captures.sfm.mapping import map_photos
 
     done = itertools.count(len(photos.names) + 2)
-    found = map_photos(database, photos, mapper, seed, lambda: report(next(done)))
+    with uncounted(listener, "global mapper") if mapper == "global" else contextlib.nullcontext():
+        found = map_photos(database, photos, mapper, seed, lambda: _report(listener, photos, next(done)))
     return None if found is None else replace(found, all_pairs=all_pairs)
+
+
+def _report(listener: Listener, photos: PreparedPhotos, done: int) -> None:
+    """Send an event of stage "poses" that is not its last one."""
+    total = 2 * len(photos.names) + 1
+    listener(Event(STAGE, min(done, total - 1), total))
 
 
 def _check_mapper(config: PoseConfig) -> None:

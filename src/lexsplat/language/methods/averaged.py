@@ -15,8 +15,9 @@ which gives u_G: 0 for a mean of length 1, and 1 for a mean no longer than that 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from torch.nn import functional
 from lexsplat.codebook import Codebook, CodebookConfig
 from lexsplat.codebook.fitting import spherical_kmeans
 from lexsplat.features import FeatureMap, FeatureMaps
+from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import CodeField
 from lexsplat.language.methods.averaging import ROWS, MeanFeatures, average_features
@@ -35,7 +37,15 @@ from lexsplat.language.methods.method import FitRun, TrainingViews, Variant
 from lexsplat.language.segments import make_segments
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import one_thread
-from lexsplat.runtime.progress import Listener, silent
+from lexsplat.runtime.progress import Event, Listener, silent, tell
+from lexsplat.runtime.sampling import evenly
+
+_TOLD_FROM = 12
+"""Fewest views for which the time is told: the calibration takes as long as about four of them."""
+_VIEWS = 3
+"""Views that are timed."""
+_SAMPLE = 4096
+"""Gaussians that are timed."""
 
 
 @dataclass(frozen=True)
@@ -91,28 +101,77 @@ class Averaged:
     def fit(self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> CodeField:
         """The features of all views on each Gaussian, then codes for them."""
 
-        def valid(name: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
-            return views.views[name].load_valid(size)
+        if len(views.views) >= _TOLD_FROM and not run.workers.distributed:
+            amount = f"{len(views.views):,} views and {len(gaussians):,} Gaussians"
+            tell("language", _forecast(gaussians, views, config, run), amount)
+        found = _means(gaussians, views, views.cameras, config, run)
+        return _with_language(gaussians, found, config.codebook, config.averaged, run)
 
-        found = average_features(
-            gaussians,
-            views.cameras,
-            views.require_features(),
-            config.averaged,
-            valid=valid,
-            memory=run.memory,
-            scratch=run.scratch,
-            workers=run.workers,
-            listener=run.listener,
-        )
-        field = field_from_means(
-            found, config.codebook, config.averaged, seed=run.seed, memory=run.memory, listener=run.listener
-        )
-        if config.averaged.segments:
-            shown = found.totals * found.visible(config.averaged)  # selections ignore Gaussians without mass
-            with one_thread():
-                field.segments = make_segments(gaussians, found.rows, shown, run.listener)
-        return field
+
+def _means(
+    gaussians: Gaussians, views: TrainingViews, cameras: Mapping[str, Camera], config: Any, run: FitRun
+) -> MeanFeatures:
+    """The features of some of the training views on each Gaussian."""
+
+    def valid(name: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+        return views.views[name].load_valid(size)
+
+    return average_features(
+        gaussians,
+        cameras,
+        views.require_features(),
+        config.averaged,
+        valid=valid,
+        memory=run.memory,
+        scratch=run.scratch,
+        workers=run.workers,
+        listener=run.listener,
+    )
+
+
+def _with_language(
+    gaussians: Gaussians, found: MeanFeatures, codebook: CodebookConfig, config: AveragedConfig, run: FitRun
+) -> CodeField:
+    """The field of Gaussians whose features are known."""
+    field = field_from_means(found, codebook, config, seed=run.seed, memory=run.memory, listener=run.listener)
+    if config.segments:
+        shown = found.totals * found.visible(config)  # selections ignore Gaussians without mass
+        with one_thread():
+            field.segments = make_segments(gaussians, found.rows, shown, run.listener)
+    return field
+
+
+def _forecast(gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> float:
+    """Seconds that the method will take, measured on a few views and on a sample of the Gaussians that they show.
+
+    The first of two runs of each part is not timed: it loads kernels.
+    """
+    count, listener = len(gaussians), run.listener
+    run = replace(run, listener=silent)
+    listener(Event("calibrate", 0, 4))
+    first, *others = evenly(sorted(views.cameras.items()), 1 + _VIEWS)
+    _means(gaussians, views, dict([first]), config, run)
+    listener(Event("calibrate", 1, 4))
+    start = time.perf_counter()
+    found = _means(gaussians, views, dict(others), config, run)
+    averaging = (time.perf_counter() - start) / len(others) * len(views.views)
+    shown = found.visible(config.averaged).nonzero()[:, 0].cpu()
+    chosen = torch.tensor(evenly(shown.tolist(), _SAMPLE), dtype=torch.int64)
+    if not len(chosen):
+        listener(Event("calibrate", 4, 4))
+        return averaging
+    part = MeanFeatures(found.means[chosen.numpy()], found.totals[chosen.to(found.totals.device)], found.dino)
+    share = len(chosen) / count
+    codebook = replace(config.codebook, sample_size=max(1, round(config.codebook.sample_size * share)))
+    sample = gaussians.select(chosen.to(gaussians.device))
+    seconds = 0.0
+    for done in (2, 3):
+        listener(Event("calibrate", done, 4))
+        start = time.perf_counter()
+        _with_language(sample, part, codebook, config.averaged, run)
+        seconds = time.perf_counter() - start
+    listener(Event("calibrate", 4, 4))
+    return averaging + seconds / share
 
 
 def features_of_codes(code_maps: Mapping[str, NDArray[np.integer]], codebook: Codebook) -> FeatureMaps:

@@ -130,6 +130,7 @@ def average_features(
     needs = Needs(gpu=gaussians.device.type == "cuda", result=4 * count * (len(ranges[0]) + 1) + carried)
     totals = torch.zeros(count, device=gaussians.device)
     done = 0
+    listener(Event("average", done, len(ranges) * len(names)))
     for columns in ranges:
         sums = torch.zeros(count, len(columns), device=gaussians.device)
         items = _Shards(shards, columns, dimensions, None if seen else feature_maps)

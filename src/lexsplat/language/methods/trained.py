@@ -18,14 +18,20 @@ from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.rendering import PreparedView, prepare
 from lexsplat.runtime.memory import DEFAULT_MEMORY
-from lexsplat.runtime.progress import Listener, silent
-from lexsplat.runtime.training import run_training
+from lexsplat.runtime.progress import Event, Listener, silent, tell
+from lexsplat.runtime.sampling import evenly
+from lexsplat.runtime.training import run_training, time_steps
 
 if TYPE_CHECKING:
     from lexsplat.runtime.training import Checkpoint
 
 REPORT_EVERY = 25
 """Steps between two events. The loss is checked as often."""
+
+_TOLD_FROM = 200
+"""Iterations from which the time is told."""
+_FIRST, _STEPS = 2, 6
+"""Steps of the calibration that are not timed, and that are."""
 
 MAX_STORE = 1 << 30
 """Bytes that kept projections may take at most, however much memory there is."""
@@ -99,6 +105,18 @@ def train_field(
         TrainingError: If the training diverges again and again.
     """
     check_views(sorted(cameras), code_maps)
+    if config.iterations >= _TOLD_FROM:
+        some = dict(evenly(sorted(cameras.items()), _FIRST + _STEPS))
+        calibrated = FieldTrainer(gaussians, codebook, config, seed=seed)
+        views = _prepare_views(calibrated.gaussians, some, config, memory)
+        training = _FrozenGeometryTraining(calibrated, views, code_maps)
+
+        def report(done: int) -> None:
+            listener(Event("calibrate", done, _FIRST + _STEPS))
+
+        report(0)
+        seconds = config.iterations * time_steps(training, _FIRST, _STEPS, report)
+        tell("language", seconds, f"{config.iterations:,} iterations")
     trainer = FieldTrainer(gaussians, codebook, config, seed=seed)
     views = _prepare_views(trainer.gaussians, cameras, config, memory)
     run_training(

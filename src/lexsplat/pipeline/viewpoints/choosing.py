@@ -28,7 +28,7 @@ from lexsplat.pipeline.viewpoints.one_photo import Photo, find_photo
 from lexsplat.pipeline.viewpoints.surroundings import SOLID, Surroundings, Target, find_surroundings
 from lexsplat.rendering import accumulate_weights
 from lexsplat.runtime.errors import CaptureError
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Event, Listener, silent, uncounted
 
 log = logging.getLogger("lexsplat")
 
@@ -116,17 +116,19 @@ def choose_views(
         side: From where they look: "inside" a room, "around" an object; "auto" finds out.
         subject: The file, for errors and warnings.
         seed: Seed of samples.
-        listener: Receives events of the stages "views" (candidates) and "comparison" (the good ones and others).
+        listener: Receives events of the stages "surroundings", "views" (candidates) and "comparison" (the good ones
+            and others).
 
     Raises:
         CaptureError: If the Gaussians form no surfaces, or hardly any place shows some.
     """
 
-    photo = find_photo(gaussians) if side == "auto" else None
-    if photo is None:
-        found = find_surroundings(gaussians, up, look_from_above(gaussians), subject, seed)
-    else:
-        found, side = _before_photo(gaussians, photo, up, subject, seed), "around"
+    with uncounted(listener, "surroundings"):
+        photo = find_photo(gaussians) if side == "auto" else None
+        if photo is None:
+            found = find_surroundings(gaussians, up, look_from_above(gaussians), subject, seed)
+        else:
+            found, side = _before_photo(gaussians, photo, up, subject, seed), "around"
     tried = _good_candidates(gaussians, found, side, seed, listener, photo)
     if not tried.cameras:
         raise CaptureError(

@@ -24,6 +24,7 @@ from lexsplat.pipeline.viewpoints.candidates import around
 from lexsplat.pipeline.viewpoints.looking import SMALL, draw_depth, look_from_above
 from lexsplat.pipeline.viewpoints.surroundings import find_surroundings
 from lexsplat.runtime.errors import CaptureError
+from lexsplat.runtime.progress import Event, Listener, silent
 
 log = logging.getLogger("lexsplat")
 
@@ -56,7 +57,12 @@ _SAME_DEPTH = (0.05, 0.2)
 
 @torch.no_grad()
 def find_floaters(
-    gaussians: Gaussians, subject: Path, *, up: NDArray[np.float64] | None = None, seed: int = 0
+    gaussians: Gaussians,
+    subject: Path,
+    *,
+    up: NDArray[np.float64] | None = None,
+    seed: int = 0,
+    listener: Listener = silent,
 ) -> NDArray[np.int64]:
     """Indices of the Gaussians that float, with a warning, if there are many; else none.
 
@@ -68,6 +74,7 @@ def find_floaters(
         subject: The file, for the warning.
         up: The up direction; None estimates it.
         seed: Seed of samples.
+        listener: Receives events of stage "floaters" in each search, one unit a view.
     """
     relative, own = isolation(gaussians)
     alone = np.minimum(relative, own)
@@ -77,7 +84,7 @@ def find_floaters(
     with contextlib.suppress(CaptureError):  # no surfaces: the choice of views refuses such splats
         for _ in range(_ROUNDS):
             kept = np.flatnonzero(~floating)
-            found = _before_surfaces(_select(gaussians, kept), up, seed)
+            found = _before_surfaces(_select(gaussians, kept), up, seed, listener)
             floating[kept[found]] = True
             if not len(found):
                 break
@@ -112,7 +119,9 @@ def _middle_radii(gaussians: Gaussians) -> NDArray[np.float64]:
     return np.asarray(np.sort(gaussians.scales.detach().cpu().double().numpy(), axis=1)[:, 1])
 
 
-def _before_surfaces(gaussians: Gaussians, up: NDArray[np.float64] | None, seed: int) -> NDArray[np.int64]:
+def _before_surfaces(
+    gaussians: Gaussians, up: NDArray[np.float64] | None, seed: int, listener: Listener
+) -> NDArray[np.int64]:
     """Indices of the large Gaussians that hang in front of surfaces, or engulf them.
 
     Raises:
@@ -127,7 +136,9 @@ def _before_surfaces(gaussians: Gaussians, up: NDArray[np.float64] | None, seed:
     points, radii = _spread(_select(gaussians, suspects)), _middle_radii(gaussians)[suspects]
     engulfing = own[suspects] < _ENGULFING
     before, on = (np.zeros(len(suspects), np.int64) for _ in range(2))
-    for camera in _cameras(_select(gaussians, solid), up, seed, generator):
+    cameras = _cameras(_select(gaussians, solid), up, seed, generator)
+    for done, camera in enumerate(cameras):
+        listener(Event("floaters", done, len(cameras)))
         for part in np.unique(parts):
             members = np.flatnonzero(parts == part)
             gaps, depths = _gaps(rest[part], camera, points[members])

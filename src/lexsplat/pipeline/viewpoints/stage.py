@@ -23,7 +23,7 @@ from lexsplat.pipeline.viewpoints.floaters import find_floaters
 from lexsplat.pipeline.viewpoints.writing import write_chosen_capture
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.runtime.progress import NOTE, Listener
+from lexsplat.runtime.progress import NOTE, Listener, uncounted
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.reading import read_splats
 
@@ -49,7 +49,7 @@ def capture_of_splats(
         folder: The scene folder.
         config: Settings of the build, of which the up direction, the seed, and those of the views are read.
         device: Device to render on.
-        listener: Receives events of stage "views".
+        listener: Receives events of the stages "splats" (reading), "floaters" and those of `choose_views`.
 
     Raises:
         FileFormatError: If the file is missing or damaged.
@@ -77,11 +77,13 @@ def _choose(
     splats: Path, poses: Path, config: BuildConfig, device: str, listener: Listener
 ) -> dict[str, Any]:
     """Choose views and write their capture; returns facts for the record of the stage."""
-    gaussians = read_splats(splats).to(device)
+    with uncounted(listener, "splats"):
+        gaussians = read_splats(splats).to(device)
     up = None if config.up is None else np.array(parse_vector(config.up))
     floaters = np.zeros(0, np.int64)
     if not config.keep_floaters:
-        floaters = find_floaters(gaussians, splats, up=up, seed=config.seed)
+        with uncounted(listener, "floaters"):
+            floaters = find_floaters(gaussians, splats, up=up, seed=config.seed, listener=listener)
     gaussians = _without(gaussians, floaters)
     chosen = choose_views(
         gaussians, up=up, side=config.views_from, subject=splats, seed=config.seed, listener=listener
