@@ -13,12 +13,12 @@ text, because most codes do not show it. Two ratios of heights have no unit and 
 - h_kp over the best height of an everyday word at code k: whether another word describes the code better;
 - h_kp over the text's own best height: whether another code fits the text better.
 
-The *strength* of a text is the geometric mean of the first ratio and the lesser one. A code shows what the text names
-if its strength exceeds `BORDER`; the relevancy is a logistic function of it, 0.5 there. The second ratio counts half
-where it is the lesser one: it falls wherever a code shares less with all texts, as where the encoder knows less or
-a feature has more that no text describes. The first ratio does not. Everyday words name no color: "green apple" may
-exceed them all at a green bowl, where "green bowl" describes more. So a thing with a color is also compared with the
-scene's objects in any color, and a part with its thing. Presence (`lexsplat.queries.presence`) reads the same heights.
+The *strength* of a text is the geometric mean of the first ratio and the lesser one. A code shows what the text
+names if the strength exceeds `BORDER`; the relevancy is a logistic function of it. A low second ratio counts half:
+all heights are lower at codes that share less with texts, the first ratio is not. Everyday words name no color:
+"green apple" may exceed them all at a green bowl, where "green bowl" describes more. So a thing with a color is also
+compared with the scene's objects in any color, and a part with its thing. Presence (`lexsplat.queries.presence`)
+reads the same heights.
 
 The constants were chosen on the second bundled scene with the bundled encoder and three encoders of
 ``benchmarks/web_like.py`` together (docs/selection.md). None depends on the encoder.
