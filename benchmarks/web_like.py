@@ -292,8 +292,6 @@ def _text_rows(
         units = _unit(text.hidden, words)
         mean = text.weights @ units / len(units)
         nearby = float((things @ _unit(sample.canonical, words).T).amax(1).mean())
-        matched = float((things * _unit(sample.names, words)).sum(1).mean())
-        shared += 0.7 * (facts.matched - matched) / float(names)
         unmatched += 0.7 * (facts.unmatched - float(mean @ middle))
         canonical += 0.7 * (facts.canonical - nearby)
         length = max(0.0, length + 0.5 * (float(mean @ mean) - facts.texts))
