@@ -42,9 +42,7 @@ def test_relevancy_by_hand():
     best = heights(w).max(1)
     h = heights(things.double().numpy())
     own = np.sort(h, axis=0)[::-1][:2].mean(0)  # 4 % of 40 codes
-    over = h / best[:, None]
-    strength = np.sqrt(np.maximum(over, 0) * np.maximum(np.minimum(h / own, over), 0))
-    expected = 1 / (1 + np.exp(-STEEPNESS * (strength - BORDER)))
+    expected = 1 / (1 + np.exp(-STEEPNESS * (np.minimum(h / own, h / best[:, None]) - BORDER)))
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 

@@ -35,14 +35,9 @@ export function heightsOf(codewords: Float32Array, text: Float32Array, mean: Flo
 export function relevancyOf(heights: Heights, best: Float32Array, rule: EverydayRule): Table {
   const peak = highest(heights, rule);
   return heights.map((height, k) => {
-    const found = strength(height / best[k], height / peak);
-    return 1 / (1 + Math.exp(-rule.steepness * (found - rule.border)));
+    const ratio = Math.min(height / peak, height / best[k]);
+    return 1 / (1 + Math.exp(-rule.steepness * (ratio - rule.border)));
   });
-}
-
-/** Geometric mean of the ratio over other texts and the lesser of both, at least 0. */
-function strength(ratio: number, reached: number): number {
-  return Math.sqrt(Math.max(0, ratio) * Math.max(0, Math.min(ratio, reached)));
 }
 
 /** The best height of a phrase: the mean of the largest. */
@@ -94,7 +89,8 @@ export function strengthsOf(heights: Heights, places: Float32Array, best: Float3
   for (let start = 0; start < places.length; start += count) {
     const place = places.subarray(start, start + count);
     const reached = dot(place, heights);
-    strengths.push(strength(reached / Math.max(dot(place, best), LEAST), reached / rule.peak));
+    const ratio = Math.max(0, reached / Math.max(dot(place, best), LEAST));
+    strengths.push(Math.sqrt(ratio * Math.max(0, Math.min(ratio, reached / rule.peak))));
   }
   return strengths;
 }

@@ -13,12 +13,10 @@ text, because most codes do not show it. Two ratios of heights have no unit and 
 - h_kp over the best height of an everyday word at code k: whether another word describes the code better;
 - h_kp over the text's own best height: whether another code fits the text better.
 
-The *strength* of a text is the geometric mean of the first ratio and the lesser one. A code shows what the text
-names if the strength exceeds `BORDER`; the relevancy is a logistic function of it. A low second ratio counts half:
-all heights are lower at codes that share less with texts, the first ratio is not. Everyday words name no color:
-"green apple" may exceed them all at a green bowl, where "green bowl" describes more. So a thing with a color is also
-compared with the scene's objects in any color, and a part with its thing. Presence (`lexsplat.queries.presence`)
-reads the same heights.
+A code shows what a text names if both ratios exceed `BORDER`. The relevancy is a logistic function of the lesser one,
+0.5 at the border. Everyday words name no color: "green apple" may exceed them all at a green bowl, where "green bowl"
+describes more. So a thing with a color is also compared with the scene's objects in any color, and a part with its
+thing. Presence (`lexsplat.queries.presence`) reads the same heights.
 
 The constants were chosen on the second bundled scene with the bundled encoder and three encoders of
 ``benchmarks/web_like.py`` together (docs/selection.md). None depends on the encoder.
@@ -34,9 +32,9 @@ import torch
 from torch import Tensor
 
 BORDER = 0.68
-"""Strength at which the relevancy is 0.5."""
+"""Ratio of heights at which the relevancy is 0.5."""
 STEEPNESS = 12.0
-"""Slope of the log-odds of the relevancy over the strength."""
+"""Slope of the log-odds of the relevancy over the ratio."""
 
 OFFSET = 0.4
 """Quantile over the codes at which a text counts as not shown."""
@@ -101,8 +99,8 @@ class EverydayScale:
         """
         heights = self.heights(codewords, texts)
         own = heights / peaks(heights).clamp_min(_LEAST)
-        found = strength(heights / (self.best[:, None] if best is None else best), own)
-        return torch.sigmoid(STEEPNESS * (found - BORDER))
+        ratio = torch.minimum(own, heights / (self.best[:, None] if best is None else best))
+        return torch.sigmoid(STEEPNESS * (ratio - BORDER))
 
 
 def _heights(codewords: Tensor, texts: Tensor, mean: Tensor) -> Tensor:
@@ -115,13 +113,3 @@ def peaks(heights: Tensor) -> Tensor:
     """The best height ``[P]`` of texts, from their heights at the codes ``[K, P]``."""
     count = max(1, round(PEAK_SHARE * len(heights)))
     return heights.topk(count, dim=0).values.mean(0)
-
-
-def strength(ratios: Tensor, reached: Tensor) -> Tensor:
-    """Geometric mean, at least 0, of ratios over the heights of other texts and the lesser of both arguments.
-
-    Args:
-        ratios: Heights over those of other texts at the same place, of any shape.
-        reached: Heights over those at the best place, of the same shape.
-    """
-    return (ratios.clamp_min(0) * torch.minimum(ratios, reached).clamp_min(0)).sqrt()

@@ -31,7 +31,7 @@ from torch import Tensor
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.segment_codes import SegmentCodes, codes_of_field
-from lexsplat.queries.everyday import BORDER, EverydayScale, everyday_words, peaks, strength
+from lexsplat.queries.everyday import BORDER, EverydayScale, everyday_words, peaks
 from lexsplat.queries.objects import whole_segments
 from lexsplat.queries.selection import Presence
 from lexsplat.queries.vocabulary import COLORS, has_color, is_part, thing_of_part
@@ -173,7 +173,7 @@ class PresenceClassifier:
                 places = self.places.distributions
                 yes, no = (YES_COLORED, NO) if has_color(phrase) else (YES_SEGMENT, NO_SEGMENT)
             ratios, reached = self._compared(heights[:, number : number + 1], places, self._best(phrase))
-            place = strength(ratios, reached)[:, 0].argmax()
+            place = _strength(ratios, reached)[:, 0].argmax()
             found.append(Evidence(float(ratios[place]), float(reached[place]), yes, no))
         return found
 
@@ -185,7 +185,7 @@ class PresenceClassifier:
     def strengths(self, texts: Tensor, places: Tensor) -> NDArray[np.float64]:
         """`Evidence.strength` of phrases ``[P, D]`` at places with distributions ``[V, K]``: ``[V, P]``."""
         heights = self.scale.heights(self.language.codebook.clip, texts)
-        return np.asarray(strength(*self._compared(heights, places, self.scale.best)).cpu().double().numpy())
+        return np.asarray(_strength(*self._compared(heights, places, self.scale.best)).cpu().double().numpy())
 
     def classify(self, phrases: Sequence[str], texts: Tensor, scores: Tensor) -> tuple[Presence, ...]:
         """Whether the scene holds each phrase; the arguments are those of `evidence`."""
@@ -249,7 +249,7 @@ class PresenceClassifier:
             self._best(thing),
         )
         at_objects, at_places = (
-            strength(*self._compared(heights, each, best))[:, 0]
+            _strength(*self._compared(heights, each, best))[:, 0]
             for each in (self.places.distributions, places)
         )
         return places[(at_places >= AT_THING) & (at_objects >= NO_SEGMENT).any()]
@@ -259,3 +259,7 @@ class PresenceClassifier:
         count = min(len(self._shown), max(PEAK_COUNT, int(PEAK_SHARE * len(self._shown))))
         best = self._shown[scores.to(self._shown.device)[self._shown].topk(count).indices]
         return self.language.select(best).code_probabilities().mean(0)
+
+
+def _strength(ratios: Tensor, heights: Tensor) -> Tensor:
+    return (ratios.clamp_min(0) * torch.minimum(ratios, heights).clamp_min(0)).sqrt()
