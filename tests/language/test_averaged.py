@@ -165,6 +165,17 @@ def test_less_memory_takes_more_passes_and_gives_the_same(memory, small, tmp_pat
     assert list((tmp_path).rglob("*.*")) == []  # the file of the means has no name
 
 
+def test_views_are_reduced_by_at_most_four() -> None:
+    camera, config = front_camera(1600, 1067), AveragedConfig()
+    sizes = {}
+    for cells in ((56, 84), (112, 168), (400, 600), (1067, 1600)):
+        found = averaging._at_map_size(camera, torch.zeros(*cells, 1), True, config)
+        sizes[cells] = (found.width, found.height)
+    assert sizes == {
+        (56, 84): (400, 267), (112, 168): (400, 267), (400, 600): (600, 400), (1067, 1600): (1600, 1067),
+    }  # fmt: skip
+
+
 def test_sums_on_a_gpu_are_bounded_by_its_free_memory_and_not_by_the_host(monkeypatch) -> None:
     gpu, free = torch.device("cuda", 0), 24 << 30
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 2 * free))
