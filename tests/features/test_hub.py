@@ -14,6 +14,7 @@ from huggingface_hub import constants, errors
 from support.refusals import assert_reports
 
 from lexsplat.features import hub
+from lexsplat.features.dino import DEFAULT_DINO
 from lexsplat.features.encoders import DEFAULT_CLIP, load_clip, load_dino
 from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.progress import NOTE
@@ -116,18 +117,20 @@ def test_license_and_size_are_reported_before_the_download(fake, caplog):
     assert "license: mit" in caplog.text
 
 
-def test_the_pinned_revision_is_taken_and_main_if_it_is_gone(fake, caplog):
-    pinned = hub.PINNED[DEFAULT_CLIP]
+@pytest.mark.parametrize(("name", "tower"), [(DEFAULT_CLIP, "clip"), (DEFAULT_DINO, "dino")])
+def test_the_pinned_revision_is_taken_and_main_if_it_is_gone(fake, caplog, name, tower):
+    pinned = hub.PINNED[name]
+    assert len(pinned) == 40 and set(pinned) <= set("0123456789abcdef")
     asked = []
     inner = fake.info
     fake.info = lambda **given: asked.append(given["revision"]) or inner(**given)
     with caplog.at_level(logging.WARNING, logger="lexsplat"):
-        hub.model_folder(DEFAULT_CLIP, "clip")
+        hub.model_folder(name, tower)
     assert asked == [pinned, "main"]
     assert f"no revision {pinned[:8]}; main is taken" in caplog.text
     fake.revisions.append(pinned)
     asked.clear()
-    hub.model_folder(DEFAULT_CLIP, "clip")
+    hub.model_folder(name, tower)
     assert asked == [pinned]
 
 
