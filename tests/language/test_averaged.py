@@ -293,9 +293,10 @@ def test_weights_are_the_softmax_of_the_cosines_by_hand() -> None:
     # Without iterations the centers are two of the three; each code is the mean of the features nearest to it.
     chosen = [pair for pair in ([0, 1], [0, 2], [1, 2]) if _codes_of(own[pair], own, unit, field)]
     assert len(chosen) == 1
+    spread = 1 - (own @ own[chosen[0]].T).max(1).mean()
     for row in range(3):
-        cosines = own[chosen[0]] @ own[row]
-        expected = np.exp(cosines / 0.5) / np.exp(cosines / 0.5).sum()
+        cosines = own[chosen[0]] @ own[row] / (0.5 * spread)
+        expected = np.exp(cosines) / np.exp(cosines).sum()
         np.testing.assert_allclose(field.weights[row].numpy(), np.sort(expected)[::-1], atol=1e-5)
     squares, shared = (means.astype(float) ** 2).sum(1), (unit.mean(0) ** 2).sum()
     agreement = np.clip((squares - shared) / (1 - shared), 0, 1)
