@@ -55,7 +55,9 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=112, help="cells along the short side")
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--only-sparse", action="store_true")
-    parser.add_argument("--mip", action="store_true", help="Gaussians with the mip filter, as `build` makes them")
+    parser.add_argument(
+        "--mip", action="store_true", help="Gaussians with the mip filter, as `build` makes them"
+    )
     options = parser.parse_args()
     run, views = demo_stage(options.demo) if options.demo else synthetic_average(options)
     if not options.demo:

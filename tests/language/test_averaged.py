@@ -304,7 +304,7 @@ def test_weights_are_the_softmax_of_the_cosines_by_hand() -> None:
     np.testing.assert_allclose(field.uncertainties.numpy(), expected, atol=1e-5)
 
 
-def test_weights_and_uncertainties_mean_the_same_in_a_wide_and_in_a_narrow_cone() -> None:
+def test_uncertainties_mean_the_same_in_a_wide_and_in_a_narrow_cone() -> None:
     """Half of the Gaussians are seen as one thing, the others as two in turn; all features share a direction."""
     rng = np.random.default_rng(0)
     first, second = rng.integers(0, 40, 1000), rng.integers(0, 40, 1000)
@@ -319,7 +319,21 @@ def test_weights_and_uncertainties_mean_the_same_in_a_wide_and_in_a_narrow_cone(
     for field in fields:
         assert (field.uncertainties[~differ] < 0.01).all()
         assert 0.5 < float(field.uncertainties[differ].mean()) < 0.7  # 1 - |F| is 0.29 to 0.07
-        assert float(field.weights[:, 0].mean()) == pytest.approx(0.93, abs=0.04)
+
+
+def test_weights_are_as_soft_for_few_codes_as_for_many_in_any_cone() -> None:
+    """Directions that fill a sphere look alike at any size of its cells: only the spread tells how far is far."""
+    inner = np.random.default_rng(0).normal(size=(3000, 3))
+    inner /= np.linalg.norm(inner, axis=1, keepdims=True)
+    largest = []
+    for shared in (0.0, 0.73):  # mean cosine of two features
+        means = np.hstack([np.full((3000, 1), shared**0.5), (1 - shared) ** 0.5 * inner])
+        found = MeanFeatures(means.astype(np.float16), torch.full((3000,), 100.0))
+        for number in (24, 96):
+            field = field_from_means(found, replace(CODES, num_codes=number), AveragedConfig(), seed=0)
+            largest.append(float(field.weights[:, 0].mean()))
+    assert max(largest) - min(largest) < 0.08  # one temperature for both numbers of codes: 0.28
+    assert 0.5 < min(largest) < 0.8
 
 
 def test_averages_are_bit_identical_on_any_number_of_threads() -> None:
