@@ -56,7 +56,7 @@ class AveragedConfig:
     """
 
     top: int = 4
-    temperature: float = 1.5
+    temperature: float = 1.9
     min_visibility: float = 0.01
     prior_visibility: float = 0.25
     shortest_side: int = 120
