@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -120,7 +121,7 @@ def test_license_and_size_are_reported_before_the_download(fake, caplog):
 @pytest.mark.parametrize(("name", "tower"), [(DEFAULT_CLIP, "clip"), (DEFAULT_DINO, "dino")])
 def test_the_pinned_revision_is_taken_and_main_if_it_is_gone(fake, caplog, name, tower):
     pinned = hub.PINNED[name]
-    assert len(pinned) == 40 and set(pinned) <= set("0123456789abcdef")
+    assert re.fullmatch("[0-9a-f]{40}", pinned)
     asked = []
     inner = fake.info
     fake.info = lambda **given: asked.append(given["revision"]) or inner(**given)

@@ -44,8 +44,8 @@ class AveragedConfig:
 
     Args:
         top: Codes kept for each Gaussian.
-        temperature: Temperature of the softmax over their cosines, without the direction that all features share, as a
-            multiple of the spread: one minus the mean cosine of a Gaussian with its nearest code. Towards 0 only the
+        temperature: Temperature of the softmax over their cosines, without the direction that all features share, in
+            multiples of the spread: one minus the mean cosine of a Gaussian with its nearest code. Towards 0 only the
             nearest code counts.
         min_visibility: Gaussians with less weight than this over all training views, in cells of the feature maps,
             count as never seen.
