@@ -54,6 +54,9 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=112, help="cells along the short side")
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--only-sparse", action="store_true")
+    parser.add_argument(
+        "--mip", action="store_true", help="Gaussians with the mip filter, as `build` makes them"
+    )
     options = parser.parse_args()
     run, views = demo_stage(options.demo) if options.demo else synthetic_average(options)
     if not options.demo:
@@ -122,7 +125,7 @@ def demo_stage(scene: Path) -> tuple[Callable[[], Any], int]:
 def synthetic_average(options: Any) -> tuple[Callable[[], Any], int]:
     """The language stage of a room whose features are random, over views from inside it."""
     width, height = map(int, options.size.split("x"))
-    gaussians = room(options.gaussians)
+    gaussians = replace(room(options.gaussians), antialiased=options.mip)
     angles = np.linspace(0, 2 * np.pi, options.views, endpoint=False)
     cameras = {
         f"{number:03}": look_at(

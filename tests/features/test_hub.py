@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from huggingface_hub import constants, errors
 from support.refusals import assert_reports
 
 from lexsplat.features import hub
+from lexsplat.features.dino import DEFAULT_DINO
 from lexsplat.features.encoders import DEFAULT_CLIP, load_clip, load_dino
 from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.progress import NOTE
@@ -116,18 +118,20 @@ def test_license_and_size_are_reported_before_the_download(fake, caplog):
     assert "license: mit" in caplog.text
 
 
-def test_the_pinned_revision_is_taken_and_main_if_it_is_gone(fake, caplog):
-    pinned = hub.PINNED[DEFAULT_CLIP]
+@pytest.mark.parametrize(("name", "tower"), [(DEFAULT_CLIP, "clip"), (DEFAULT_DINO, "dino")])
+def test_the_pinned_revision_is_taken_and_main_if_it_is_gone(fake, caplog, name, tower):
+    pinned = hub.PINNED[name]
+    assert re.fullmatch("[0-9a-f]{40}", pinned)
     asked = []
     inner = fake.info
     fake.info = lambda **given: asked.append(given["revision"]) or inner(**given)
     with caplog.at_level(logging.WARNING, logger="lexsplat"):
-        hub.model_folder(DEFAULT_CLIP, "clip")
+        hub.model_folder(name, tower)
     assert asked == [pinned, "main"]
     assert f"no revision {pinned[:8]}; main is taken" in caplog.text
     fake.revisions.append(pinned)
     asked.clear()
-    hub.model_folder(DEFAULT_CLIP, "clip")
+    hub.model_folder(name, tower)
     assert asked == [pinned]
 
 

@@ -25,9 +25,13 @@ log = logging.getLogger("lexsplat")
 BUNDLED_ENCODERS = Path(__file__).resolve().parent.parent / "demo" / "encoders"
 """Folder of the bundled encoders."""
 
-PINNED = {"laion/CLIP-ViT-B-16-laion2B-s34B-b88K": "7288da5a0d6f0b51c4a2b27c624837a9236d0112"}
-"""Revisions of models on the hub that are looked for before ``main``. This one is pinned by public projects, which
-read its ``open_clip_model.safetensors``. No test of lexsplat downloads it."""
+PINNED = {
+    # Pinned by public projects, which read its open_clip_model.safetensors.
+    "laion/CLIP-ViT-B-16-laion2B-s34B-b88K": "7288da5a0d6f0b51c4a2b27c624837a9236d0112",
+    # https://huggingface.co/facebook/dino-vits8/tree/483f2fc47097ae6f0afc8bcfb43004224bddeae2 has model.safetensors.
+    "facebook/dino-vits8": "483f2fc47097ae6f0afc8bcfb43004224bddeae2",
+}
+"""Revisions of the default models on the hub that are looked for before ``main``. No test downloads them."""
 
 _PREPROCESSING = ("preprocessor_config.json", "processor_config.json")
 _VOCABULARIES = (

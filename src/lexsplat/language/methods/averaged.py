@@ -54,8 +54,9 @@ class AveragedConfig:
 
     Args:
         top: Codes kept for each Gaussian.
-        temperature: Temperature of the softmax over their cosines, without the direction that all features share;
-            towards 0 only the nearest code counts.
+        temperature: Temperature of the softmax over their cosines, without the direction that all features share, in
+            multiples of the spread: one minus the mean cosine of a Gaussian with its nearest code. Towards 0 only the
+            nearest code counts.
         min_visibility: Gaussians with less weight than this over all training views, in cells of the feature maps,
             count as never seen.
         prior_visibility: Weight in cells at which a Gaussian's mean is half trusted; below it u tends to 1.
@@ -65,7 +66,7 @@ class AveragedConfig:
     """
 
     top: int = 4
-    temperature: float = 1 / 40
+    temperature: float = 1.9
     min_visibility: float = 0.01
     prior_visibility: float = 0.25
     shortest_side: int = 120
@@ -220,7 +221,7 @@ def field_from_means(
     budget.require_sample("language", what, looked_at, dimensions, number, 0, memory, share=0.5)
     visible, lambda_dino = found.visible(config), codebook_config.lambda_dino
     with one_thread():  # the order of a sum decides its last bit, which can decide between two codes
-        codewords, centers, common = _fit(found, visible, codebook_config, seed, listener)
+        codewords, centers, common, spread = _fit(found, visible, codebook_config, seed, listener)
         shared = float(common[0].square().sum().clamp(max=1 - 1e-6))
         kept = min(config.top, len(codewords))
         codes = torch.zeros(count, kept, dtype=torch.uint8, device=device)
@@ -231,7 +232,7 @@ def field_from_means(
             halves = found.halves(rows)
             cosines, nearest = (_joined(_own(halves, common), lambda_dino) @ centers.T).topk(kept, dim=1)
             codes[rows] = nearest.to(torch.uint8)
-            weights[rows] = torch.softmax(cosines / config.temperature, 1) * visible[rows, None]
+            weights[rows] = torch.softmax(cosines / (config.temperature * spread), 1) * visible[rows, None]
             agreement[rows] = ((halves[0].square().sum(-1) - shared) / (1 - shared)).clamp(0, 1)
     trusted = found.totals / (found.totals + config.prior_visibility).clamp_min(1e-12)
     uncertainties = torch.where(visible, 1 - agreement * trusted, torch.ones_like(trusted))
@@ -240,22 +241,22 @@ def field_from_means(
 
 def _fit(
     found: MeanFeatures, visible: Tensor, config: CodebookConfig, seed: int, listener: Listener
-) -> tuple[Tensor, Tensor, list[Tensor]]:
+) -> tuple[Tensor, Tensor, list[Tensor], float]:
     """Spherical k-means over the visible Gaussians, without the direction that all features share.
 
     Features of an encoder lie in a cone. Cosines inside it depend on its width, those of what is left without its
-    axis do not: the temperature of the softmax then holds for narrow and for wide cones.
+    axis do not. How far features lie from their codes then still depends on the encoder, the scene and K: the spread.
 
     Returns:
         Unit CLIP codewords ``[K, Dc]``, at most one a Gaussian; their centers without the shared directions
         ``[K, Dc + Dd]``, each half of unit length; those directions, the means of the Gaussians' unit features, one
-        for each half.
+        for each half; the spread, the mean distance of a feature from its code in similarity, above 0.
     """
     generator = torch.Generator().manual_seed(seed)
     seen = visible.nonzero()[:, 0].cpu()
     if len(seen) == 0:
         halves = [torch.ones_like(half) / half.shape[1] ** 0.5 for half in found.halves(slice(0, 1))]
-        return halves[0], torch.cat(halves, 1), [torch.zeros_like(half[0]) for half in halves]
+        return halves[0], torch.cat(halves, 1), [torch.zeros_like(half[0]) for half in halves], 1.0
     if len(seen) > config.sample_size:
         seen = seen[torch.randperm(len(seen), generator=generator)[: config.sample_size].sort().values]
     sample = [functional.normalize(half, dim=-1) for half in found.halves(seen)]
@@ -272,10 +273,11 @@ def _fit(
         listener=listener,
     )
     centers = clip if dino is None else torch.cat([clip, dino], 1)
-    nearest = (_joined(own, config.lambda_dino) @ centers.T).argmax(1)
+    similarities, nearest = (_joined(own, config.lambda_dino) @ centers.T).max(1)
+    spread = max(1.0 + (config.lambda_dino if found.dino else 0.0) - float(similarities.mean()), 1e-6)
     sums = torch.zeros_like(clip).index_add_(0, nearest, sample[0])
     empty = ~sums.any(-1, keepdim=True)
-    return functional.normalize(torch.where(empty, common[0] + clip, sums), dim=-1), centers, common
+    return functional.normalize(torch.where(empty, common[0] + clip, sums), dim=-1), centers, common, spread
 
 
 def _own(halves: Sequence[Tensor], common: Sequence[Tensor]) -> list[Tensor]:

@@ -43,6 +43,10 @@ MAX_STORE = 1 << 30
 """Bytes that the sums may take on the host at most, however much memory there is."""
 
 
+MOST_REDUCED = 4.0
+"""Largest factor by which views are reduced."""
+
+
 @dataclass(frozen=True)
 class MeanFeatures:
     """The mean feature of each Gaussian over the training views.
@@ -264,14 +268,16 @@ def _any_nonzero(values: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def _at_map_size(camera: Camera, features: Tensor, antialiased: bool, config: AveragedConfig) -> Camera:
-    """The camera with about as many pixels as the map has cells; more pixels add no information.
+    """The camera with about as many pixels as the map has cells, reduced by at most `MOST_REDUCED`.
 
+    Maps would lose little by a stronger reduction, but small Gaussians are then never drawn and get no language.
     Without the mip filter Gaussians look too large at low resolution, so such scenes are rendered at full size.
     """
     if not antialiased:
         return camera
     short = min(camera.width, camera.height)
-    return camera.downscaled(max(1.0, min(camera.width / features.shape[1], short / config.shortest_side)))
+    wanted = min(camera.width / features.shape[1], short / config.shortest_side, MOST_REDUCED)
+    return camera.downscaled(max(1.0, wanted))
 
 
 def _ranges(dimensions: int, count: int, memory_bytes: int) -> Iterator[range]:
