@@ -197,8 +197,12 @@ def exact(tmp_path_factory) -> Path:
             lambda path: (path.unlink(), np.save(path.with_suffix(".npy"), np.zeros(96))),
             ["view_03.npy", "[levels, h, w]", "[96]"],
         ),
+        (
+            lambda path: (path.unlink(), np.save(path.with_suffix(".npy"), np.zeros((3, 72, 96)))),
+            ["view_03.npy", "1 level, as view_02 has", "3 levels"],
+        ),
     ],
-    ids=["none", "another size", "colors", "no image", "fractions", "a row"],
+    ids=["none", "another size", "colors", "no image", "fractions", "a row", "other levels"],
 )
 def test_wrong_segments_are_reported_before_structure_from_motion_and_reconstruction(
     tiny_capture, exact, tmp_path, monkeypatch, change, told
@@ -295,6 +299,10 @@ def test_segments_share_the_stored_crops_and_are_found_once(tiny_capture, exact,
             labels = segmenter.labels(view, size_of_map(view.capture_size, config))
             expected = pooled_by_loops(plain[name].clip.numpy(), labels)
             np.testing.assert_allclose(found[name].clip, expected, atol=1e-5)
+            assert len(found[name].levels) == (len(labels) if len(labels) > 1 else 0)
+            for level, alone in zip(found[name].levels, labels):
+                expected = pooled_by_loops(plain[name].clip.numpy(), alone[None])
+                np.testing.assert_allclose(level.clip, expected, atol=1e-5)
         monkeypatch.setattr(type(segmenter), "labels", lambda *_: pytest.fail("found again"))
         again = pooled_features(maps, capture, segmenter, config, cache_dir=tmp_path)
         assert torch.equal(again["view_03.png"].clip, found["view_03.png"].clip)
@@ -359,5 +367,9 @@ def test_exact_masks_improve_a_scene_and_another_source_makes_it_anew(
     capsys.readouterr()
     assert cli.main([*command, str(exact)]) == 0
     assert "features: 1/1 kept" in capsys.readouterr().err
+    assert cli.main(["info", str(output), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["language_levels"] == 1
     assert cli.main([*command, "slic"]) == 0
     assert "features: 1/1 kept" not in capsys.readouterr().err
+    assert cli.main(["info", str(output), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["language_levels"] == len(SUPERPIXELS)
