@@ -1,8 +1,8 @@
 """Segments of photos in 2D, and features that are pooled by them, so that they end where segments end.
 
 Segments come from superpixels (SLIC), from a folder with one map a photo, or from SAM 2. There may be several levels
-of them, from parts to things. The features of a segment are replaced by their mean. Each level makes a map of its own,
-and their mean is the map of methods that have one language for all levels.
+of them. The features of a segment are replaced by their mean. Each level is an observation of the pixel; levels from
+parts to things also make a map each, for methods that keep them apart.
 """
 
 from __future__ import annotations
@@ -43,6 +43,9 @@ _ENDINGS = (".png", ".npy", "_s.npy")
 
 class Segmenter(Protocol):
     """Finds the segments of photos."""
+
+    kept_apart: bool
+    """Whether its levels are parts and things, which have language of their own."""
 
     def key(self, view: View) -> list[Any]:
         """Everything the segments of a view depend on, as JSON-like values."""
@@ -103,6 +106,8 @@ def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
 class Superpixels:
     """SLIC superpixels of several sizes, by scikit-image. The same photo gives the same ones."""
 
+    kept_apart = False
+
     def key(self, view: View) -> list[Any]:
         """The photo and the settings."""
         return ["slic", SUPERPIXELS, _COMPACTNESS, pixels_hash(view, _reduced(view.capture_size))]
@@ -135,6 +140,8 @@ class SegmentFolder:
 
     Maps have the photo's aspect at any size, and are drawn on the photo as it is stored, or undistorted.
     """
+
+    kept_apart = True
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -266,6 +273,7 @@ def pooled_features(
         LexsplatError: If a view has no segments (`SegmentFolder.labels`).
     """
     paths: dict[str, Path] = {}
+    apart = segmenter.kept_apart
     for done, name in enumerate(maps, start=1):
         view = capture.views[name]
         size = size_of_map(view.capture_size, config)
@@ -280,7 +288,7 @@ def pooled_features(
         found = maps[name]
         rows, cols = found.clip.shape[:2]
         labels = read_labels(paths[name], cols, rows)
-        levels = labels.split(1) if len(labels) > 1 else ()
+        levels = labels.split(1) if apart and len(labels) > 1 else ()
         return replace(_pooled(found, labels), levels=tuple(_pooled(found, level) for level in levels))
 
     return FeatureMaps(list(maps), load, 0, source=maps)

@@ -12,8 +12,8 @@ codebook is then fitted to the Gaussians (Eq. 2 to 4; without the DINO half unle
 carries a softmax over its nearest codes. The length of the mean of unit vectors measures how far the views agree,
 which gives u_G: 0 for a mean of length 1, and 1 for a mean no longer than that of all features of the scene.
 
-Where photos have several levels of 2D segments (`lexsplat.features.segments2d`), each Gaussian has a mean and codes at
-each level, from one codebook. u_G is the mean over the levels.
+Where photos have several levels of 2D segments (`lexsplat.features.segments2d`), each Gaussian has a mean and codes
+at each level, from one codebook. u_G is the mean over the levels.
 """
 
 from __future__ import annotations
