@@ -199,7 +199,7 @@ def exact(tmp_path_factory) -> Path:
         ),
         (
             lambda path: (path.unlink(), np.save(path.with_suffix(".npy"), np.zeros((3, 72, 96)))),
-            ["view_03.npy", "1 level, as view_01 has", "3 levels"],
+            ["view_03.npy", "1 level, as view_0", "3 levels"],
         ),
     ],
     ids=["none", "another size", "colors", "no image", "fractions", "a row", "other levels"],

@@ -90,9 +90,15 @@ class CodeField:
         if self.num_levels == 1:
             return ()
         parts = zip(self.codes.chunk(self.num_levels, 1), self.weights.chunk(self.num_levels, 1))
-        normalize, rest = torch.nn.functional.normalize, {"method": self.method, "segments": self.segments}
         return tuple(
-            CodeField(self.codebook, codes, normalize(weights, p=1, dim=1), self.uncertainties, **rest)
+            CodeField(
+                self.codebook,
+                codes,
+                torch.nn.functional.normalize(weights, p=1, dim=1),
+                self.uncertainties,
+                method=self.method,
+                segments=self.segments,
+            )
             for codes, weights in parts
         )
 
