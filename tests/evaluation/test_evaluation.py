@@ -59,6 +59,7 @@ class PerfectField:
 
     method = "traced"
     segments = None
+    levels = ()
 
     def __init__(self, order=(0, 1, 2)):
         codewords = torch.eye(4)[:3] + 0.5 * torch.eye(4)[3]  # a little of "stuff" is in everything

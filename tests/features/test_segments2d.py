@@ -197,8 +197,12 @@ def exact(tmp_path_factory) -> Path:
             lambda path: (path.unlink(), np.save(path.with_suffix(".npy"), np.zeros(96))),
             ["view_03.npy", "[levels, h, w]", "[96]"],
         ),
+        (
+            lambda path: (path.unlink(), np.save(path.with_suffix(".npy"), np.zeros((3, 72, 96)))),
+            ["view_03.npy", "1 level, as view_0", "3 levels"],
+        ),
     ],
-    ids=["none", "another size", "colors", "no image", "fractions", "a row"],
+    ids=["none", "another size", "colors", "no image", "fractions", "a row", "other levels"],
 )
 def test_wrong_segments_are_reported_before_structure_from_motion_and_reconstruction(
     tiny_capture, exact, tmp_path, monkeypatch, change, told
@@ -271,20 +275,32 @@ def test_the_identity_follows_the_content_of_the_folder(tiny_capture, exact, tmp
     assert SegmentFolder(folder).key(view) != SegmentFolder(exact).key(view)
 
 
+@pytest.fixture(scope="module")
+def two_levels(exact, tmp_path_factory) -> Path:
+    """The exact segments of every photo, and both spheres as one thing."""
+    folder = tmp_path_factory.mktemp("two_levels")
+    for path in sorted(exact.glob("*.png")):
+        parts = np.asarray(Image.open(path)).astype(int) - 1
+        write(folder, path.stem, ".npy", np.stack([parts, np.minimum(parts, 1)]))
+    return folder
+
+
 def few_views(capture: Capture, names: list[str]) -> Capture:
     return replace(
         capture, views={name: capture.views[name] for name in names}, train_names=tuple(names), test_names=()
     )
 
 
-def test_segments_share_the_stored_crops_and_are_found_once(tiny_capture, exact, tmp_path, monkeypatch):
+def test_segments_share_the_stored_crops_and_are_found_once(
+    tiny_capture, exact, two_levels, tmp_path, monkeypatch
+):
     config = FeatureConfig(crop_sizes=(0.5,), crop_strides=(0.5,), map_cells=18)
     capture = few_views(load_capture(tiny_capture), ["view_03.png", "view_07.png"])
     clip = load_clip("bundled")
     plain = extract_features(capture, clip, None, config, cache_dir=tmp_path)
     monkeypatch.setattr(clip, "encode_images", lambda _: pytest.fail("encoded again"))
     maps = extract_features(capture, clip, None, replace(config, segments="slic"), cache_dir=tmp_path)
-    for segments in ("slic", str(exact)):
+    for segments, apart in (("slic", 0), (str(exact), 0), (str(two_levels), 2)):
         segmenter, events = load_segmenter(segments), []
         found = pooled_features(maps, capture, segmenter, config, cache_dir=tmp_path, listener=events.append)
         assert [(event.stage, event.done, event.total) for event in events] == [
@@ -295,6 +311,10 @@ def test_segments_share_the_stored_crops_and_are_found_once(tiny_capture, exact,
             labels = segmenter.labels(view, size_of_map(view.capture_size, config))
             expected = pooled_by_loops(plain[name].clip.numpy(), labels)
             np.testing.assert_allclose(found[name].clip, expected, atol=1e-5)
+            assert len(found[name].levels) == apart, "sizes of superpixels are observations of one thing"
+            for level, alone in zip(found[name].levels, labels):
+                expected = pooled_by_loops(plain[name].clip.numpy(), alone[None])
+                np.testing.assert_allclose(level.clip, expected, atol=1e-5)
         monkeypatch.setattr(type(segmenter), "labels", lambda *_: pytest.fail("found again"))
         again = pooled_features(maps, capture, segmenter, config, cache_dir=tmp_path)
         assert torch.equal(again["view_03.png"].clip, found["view_03.png"].clip)
@@ -345,7 +365,7 @@ def measured(scene: Path) -> float:
 
 
 def test_exact_masks_improve_a_scene_and_another_source_makes_it_anew(
-    tiny_capture, built, exact, tmp_path, capsys
+    tiny_capture, built, exact, two_levels, tmp_path, capsys
 ):
     output = tmp_path / "scene"
     command = [
@@ -359,5 +379,10 @@ def test_exact_masks_improve_a_scene_and_another_source_makes_it_anew(
     capsys.readouterr()
     assert cli.main([*command, str(exact)]) == 0
     assert "features: 1/1 kept" in capsys.readouterr().err
-    assert cli.main([*command, "slic"]) == 0
+    assert cli.main(["info", str(output), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["language_levels"] == 1
+    assert cli.main([*command, str(two_levels)]) == 0
     assert "features: 1/1 kept" not in capsys.readouterr().err
+    assert cli.main(["info", str(output), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["language_levels"] == 2
+    assert measured(output) > measured(built) + 0.15

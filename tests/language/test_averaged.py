@@ -8,12 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from support.language_scene import LanguageScene, label_accuracy, make_scene
+from support.language_scene import IGNORED, LanguageScene, label_accuracy, make_scene
 from support.rendering_reference import blend, front_camera, project, random_gaussians, to_float64
 from torch.nn.functional import normalize
 
 from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureMap, FeatureMaps
+from lexsplat.features.segments2d import pool
 from lexsplat.language.fields import CodeField
 from lexsplat.language.methods import METHODS, averaged, averaging
 from lexsplat.language.methods.averaged import (
@@ -24,6 +25,8 @@ from lexsplat.language.methods.averaged import (
 from lexsplat.language.methods.averaging import MeanFeatures, average_features, sums_bound
 from lexsplat.language.methods.method import FitRun, TrainingViews
 from lexsplat.pipeline.config import BuildConfig
+from lexsplat.queries.relevancy import QueryConfig, Question, gaussian_relevancy
+from lexsplat.queries.scoring import scores_in_form
 from lexsplat.queries.visibility import hidden_gaussians
 from lexsplat.runtime.errors import MemoryBudgetError, TaskError
 from lexsplat.runtime.memory import parse_bytes
@@ -108,6 +111,95 @@ def test_things_that_are_alike_to_clip_get_codes_of_their_own_by_dino() -> None:
     blind = field_from_means(MeanFeatures(clip, torch.ones(60)), replace(codes, num_codes=2), config)
     assert blind.codebook.clip.shape == (2, 2)
     assert torch.equal(blind.codes[:20], blind.codes[20:40])
+
+
+def test_levels_are_averaged_apart_with_their_halves(small) -> None:
+    clip, dino = random_features(small.cameras), random_features(small.cameras, dimensions=5, seed=1)
+    other, others = (random_features(small.cameras, d, seed) for d, seed in ((7, 2), (5, 3)))
+    maps = {
+        name: FeatureMap(
+            clip[name].clip,
+            dino[name].clip,
+            (FeatureMap(clip[name].clip, dino[name].clip), FeatureMap(other[name].clip, others[name].clip)),
+        )
+        for name in clip
+    }
+    found = average_features(small.gaussians, small.cameras, maps, replace(FULL_SIZE, dino=True))
+    alone = [
+        average_features(small.gaussians, small.cameras, level, FULL_SIZE).means
+        for level in (clip, dino, other, others)
+    ]
+    np.testing.assert_array_equal(found.means, np.concatenate(alone, 1))
+    np.testing.assert_array_equal(found.rows(slice(None)), np.concatenate(alone[::2], 1))
+    rows, count = found.apart(), len(small.gaussians)
+    assert len(rows.totals) == 2 * count
+    for level in (0, 1):
+        halves = rows.halves(torch.arange(level, 2 * count, 2))
+        for half, expected in zip(halves, alone[2 * level :]):
+            np.testing.assert_array_equal(half, expected.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def parts_and_things(balls) -> tuple[CodeField, CodeField]:
+    """Balls 0 and 1 are parts of one thing: exact masks of parts and of things, kept apart and as one level."""
+    rng = torch.Generator().manual_seed(0)
+    maps, means = {}, {}
+    for name, labels in balls.code_maps.items():
+        parts = torch.from_numpy(np.where(labels == IGNORED, -1, labels.astype(int)))
+        things = torch.where(parts == 1, 0, parts)
+        features = torch.eye(6)[parts] + 0.3 * torch.randn(*parts.shape, 6, generator=rng)
+        features = normalize(features, dim=-1) * (parts >= 0)[..., None]
+        levels = torch.stack([parts, things])
+        means[name] = FeatureMap(pool(features, levels))
+        maps[name] = FeatureMap(
+            means[name].clip, levels=tuple(FeatureMap(pool(features, level)) for level in levels.split(1))
+        )
+    views = {
+        name: SimpleNamespace(camera=camera, load_valid=lambda size: None)
+        for name, camera in balls.cameras.items()
+    }
+    config = BuildConfig(codebook=replace(CODES, num_codes=20))
+    kept, mixed = (
+        METHODS["averaged"].fit(balls.gaussians, TrainingViews(views, features=each), config, FitRun())
+        for each in (maps, means)
+    )
+    return kept, mixed
+
+
+@pytest.mark.parametrize("form", ["code", "segment"])
+def test_a_part_is_answered_from_the_level_of_parts_and_a_thing_from_that_of_things(
+    balls, parts_and_things, form
+) -> None:
+    kept, mixed = parts_and_things
+    thing = normalize(torch.eye(6)[0] + torch.eye(6)[1], dim=0)
+    query = QueryConfig(form=form, temperature=2.0)
+    question = Question(torch.stack([torch.eye(6)[0], thing]), torch.eye(6)[5:], query)
+    inside = torch.from_numpy(np.stack([balls.labels == 0, balls.labels <= 1]))
+    own = gaussian_relevancy(kept, question)
+    for prompt, level in enumerate(kept.levels):
+        torch.testing.assert_close(own[prompt], gaussian_relevancy(level, question)[prompt])
+    scores = scores_in_form(kept, query, own, ["yes", "yes"])
+    for row, mask in zip(scores, inside):
+        limit = 0.5 if form == "segment" else 0.75
+        assert ((row >= limit) == mask).float().mean() > 0.97
+    # One mean of both levels resembles neither the part nor the thing as much.
+    worse = gaussian_relevancy(mixed, question)
+    for row, other, mask in zip(own, worse, inside):
+        assert float(row[mask].median()) > float(other[mask].median())
+
+
+def test_levels_do_not_mix_where_part_and_thing_differ(balls, parts_and_things) -> None:
+    kept, mixed = parts_and_things
+
+    def of_the_other(field: CodeField) -> float:
+        """Median cosine of the first ball's Gaussians with the second ball."""
+        features = field.code_probabilities()[torch.from_numpy(balls.labels == 0)] @ field.codebook.clip
+        return float(normalize(features, dim=-1)[:, 1].median())
+
+    parts, things = kept.levels
+    assert of_the_other(parts) < 0.1
+    assert of_the_other(things) > 0.3
+    assert 0.15 < of_the_other(mixed) < 0.3, "one mean lies between them"
 
 
 def test_cells_without_a_feature_are_ignored(small) -> None:

@@ -258,6 +258,50 @@ def test_codes_weights_and_u_take_nine_bytes_a_gaussian_and_keep_the_sum_of_the_
     assert all(torch.equal(value, again.tensors()[name]) for name, value in stored.items()), "stored again"
 
 
+def make_leveled(balls) -> tuple[CodeField, list[CodeField]]:
+    """A field of two levels, and the field of each alone."""
+    first = make_coded(balls)
+    codes, weights = first.codes.flip(0), first.weights.flip(0).index_fill(0, torch.tensor([3]), 0)
+    weights[-4] = weights[0]  # the same Gaussian has no language at both levels
+    alone = [first, CodeField(balls.codebook, codes, weights, first.uncertainties)]
+    both = torch.cat([first.codes, codes], 1), torch.cat([first.weights, weights], 1) / 2
+    return CodeField(balls.codebook, *both, first.uncertainties, num_levels=2), alone
+
+
+def test_levels_are_kept_apart_also_on_disk_and_their_mean_is_the_field(balls) -> None:
+    field, alone = make_leveled(balls)
+    table = torch.rand(balls.codebook.num_codes, 3, generator=generator())
+    mean = sum(level.code_probabilities().double() @ table.double() for level in alone).numpy() / 2
+    np.testing.assert_allclose(field.scores(table), mean, atol=1e-6)
+    stored = field.tensors()
+    assert sum(stored[name].nbytes for name in ("codes", "weights", "uncertainties")) == 17 * len(mean)
+    again = field_from_tensors(stored, field.metadata())
+    index = torch.tensor([7, 3, 0])
+    for kept, steps in ((field, 1e-6), (again, 2.5 / 255)):
+        assert len(kept.levels) == 2
+        for level, part, known in zip(kept.levels, kept.select(index).levels, alone):
+            assert torch.equal(level.codes, known.codes)
+            assert torch.equal(part.codes, known.codes[index])
+            assert part.levels == level.levels == (), "a level has none"
+            torch.testing.assert_close(level.weights, known.weights, rtol=0, atol=steps)
+            torch.testing.assert_close(level.weights.sum(1), known.weights.sum(1))
+    assert field.facts()["levels"] == 2
+
+
+def test_a_field_of_one_level_is_stored_as_before(balls) -> None:
+    field = make_coded(balls)
+    assert field.metadata() == {"kind": "codes", "method": "averaged"}
+    assert list(field.facts()) == ["codes", "codes_used", "perplexity", "unseen"]
+    assert field.levels == make_trained(balls).levels == ()
+
+
+@pytest.mark.parametrize("levels", ["3", "0", "two"])
+def test_levels_that_do_not_fit_the_codes_are_refused(balls, levels) -> None:
+    field, _ = make_leveled(balls)
+    with pytest.raises(ValueError, match=levels):
+        field_from_tensors(field.tensors(), {**field.metadata(), "levels": levels})
+
+
 @pytest.mark.parametrize("make", [make_trained, make_coded])
 def test_a_field_survives_a_safetensors_file(balls, make, tmp_path) -> None:
     field = make(balls)

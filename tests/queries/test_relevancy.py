@@ -165,6 +165,25 @@ def test_scores_of_gaussians_come_from_their_own_distributions(cloud, form):
 
 
 @pytest.mark.parametrize("form", FORMS)
+def test_the_level_with_the_highest_peak_answers_a_prompt(cloud, form):
+    """Two levels that differ in which codes the Gaussians have; a peak is the mean of 20 Gaussians."""
+    first, gaussians, camera = cloud
+    other = CodeField(first.codebook, (11 - first.codes).sort(1)[0], first.weights, first.uncertainties)
+    both = torch.cat([first.codes, other.codes], 1), torch.cat([first.weights, other.weights], 1) / 2
+    field, question = CodeField(first.codebook, *both, first.uncertainties, num_levels=2), asked(form, 8)
+    alone = [queries.gaussian_relevancy(level, question).numpy() for level in (first, other)]
+    peaks = [np.sort(scores, axis=1)[:, -20:].mean(1) for scores in alone]
+    best = np.argmax(peaks, axis=0)
+    assert 0 < best.sum() < 8, "each level answers some prompt"
+    found = queries.gaussian_relevancy(field, question).numpy()
+    maps = [queries.render_relevancy(level, gaussians, camera, question) for level in (first, other)]
+    shown = queries.render_relevancy(field, gaussians, camera, question)
+    for prompt, level in enumerate(best):
+        np.testing.assert_allclose(found[prompt], alone[level][prompt], atol=1e-6)
+        torch.testing.assert_close(shown[prompt], maps[level][prompt], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("form", FORMS)
 def test_scores_of_gaussians_never_hold_all_distributions(cloud, form, monkeypatch):
     """``[N, K]`` of millions of Gaussians would be gigabytes."""
     field, _, _ = cloud

@@ -41,10 +41,12 @@ class FeatureMap:
     Args:
         clip: Image-text features ``[h, w, Dc]``, float32, unit length.
         dino: Dense features ``[h, w, Dd]``, float32, unit length; None without DINO.
+        levels: The view pooled by each of several levels of 2D segments apart; () without.
     """
 
     clip: Tensor
     dino: Tensor | None = None
+    levels: tuple[FeatureMap, ...] = ()
 
     def __post_init__(self) -> None:
         if self.clip.ndim != 3 or (self.dino is not None and self.dino.shape[:2] != self.clip.shape[:2]):
@@ -54,7 +56,8 @@ class FeatureMap:
     @property
     def nbytes(self) -> int:
         """Bytes held in memory."""
-        return sum(part.numel() * part.element_size() for part in (self.clip, self.dino) if part is not None)
+        own = sum(part.numel() * part.element_size() for part in (self.clip, self.dino) if part is not None)
+        return own + sum(level.nbytes for level in self.levels)
 
 
 class FeatureMaps(Mapping[str, FeatureMap]):

@@ -61,6 +61,7 @@ class Sam2Segmenter(PretrainedModel):
     """
 
     tower = "segments"
+    kept_apart = True
 
     def __init__(
         self, folder: Path, name: str, device: torch.device | str = "cpu", points: int | None = None

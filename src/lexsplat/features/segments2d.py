@@ -1,13 +1,14 @@
 """Segments of photos in 2D, and features that are pooled by them, so that they end where segments end.
 
 Segments come from superpixels (SLIC), from a folder with one map a photo, or from SAM 2. There may be several levels
-of them, from parts to things. The features of a segment are replaced by their mean; levels are pooled apart, and each
-counts as an observation of the pixel.
+of them. The features of a segment are replaced by their mean. Each level is an observation of the pixel; levels from
+parts to things also make a map each, for methods that keep them apart.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -42,6 +43,9 @@ _ENDINGS = (".png", ".npy", "_s.npy")
 
 class Segmenter(Protocol):
     """Finds the segments of photos."""
+
+    kept_apart: bool
+    """Whether its levels are parts and things, which have language of their own."""
 
     def key(self, view: View) -> list[Any]:
         """Everything the segments of a view depend on, as JSON-like values."""
@@ -102,6 +106,8 @@ def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
 class Superpixels:
     """SLIC superpixels of several sizes, by scikit-image. The same photo gives the same ones."""
 
+    kept_apart = False
+
     def key(self, view: View) -> list[Any]:
         """The photo and the settings."""
         return ["slic", SUPERPIXELS, _COMPACTNESS, pixels_hash(view, _reduced(view.capture_size))]
@@ -134,6 +140,8 @@ class SegmentFolder:
 
     Maps have the photo's aspect at any size, and are drawn on the photo as it is stored, or undistorted.
     """
+
+    kept_apart = True
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -209,15 +217,28 @@ def check_segments(config: FeatureConfig, capture: Capture) -> None:
         capture: Its training views must have segments, if they come from a folder.
 
     Raises:
-        FileFormatError: If a map is missing or no map of integers.
+        FileFormatError: If a map is missing or no map of integers, or has other levels than that of another photo.
         CaptureError: If a map cannot be read, or does not have the photo's aspect.
         ModelError: If the name is no word, folder or name of a model.
     """
     name = config.segments
     if sam2_name(name) is None and is_folder_of_segments(name):
         folder = SegmentFolder(Path(name).expanduser())
+        levels = 0
         for view in capture.train_views:
-            folder.labels(view, size_of_map(view.capture_size, config))
+            found = len(folder.labels(view, size_of_map(view.capture_size, config)))
+            levels = levels or found
+            if found != levels:
+                raise FileFormatError(
+                    folder.path(view),
+                    expected=f"{_count(levels)}, as {capture.train_views[0].stem} has",
+                    found=_count(found),
+                    remedy="give each photo the same levels of segments, in one order",
+                )
+
+
+def _count(levels: int) -> str:
+    return f"{levels} level" + "s" * (levels != 1)
 
 
 def segments_identity(name: str, capture: Capture) -> list[str]:
@@ -252,6 +273,7 @@ def pooled_features(
         LexsplatError: If a view has no segments (`SegmentFolder.labels`).
     """
     paths: dict[str, Path] = {}
+    apart = segmenter.kept_apart
     for done, name in enumerate(maps, start=1):
         view = capture.views[name]
         size = size_of_map(view.capture_size, config)
@@ -266,9 +288,14 @@ def pooled_features(
         found = maps[name]
         rows, cols = found.clip.shape[:2]
         labels = read_labels(paths[name], cols, rows)
-        return FeatureMap(pool(found.clip, labels), None if found.dino is None else pool(found.dino, labels))
+        levels = labels.split(1) if apart and len(labels) > 1 else ()
+        return replace(_pooled(found, labels), levels=tuple(_pooled(found, level) for level in levels))
 
     return FeatureMaps(list(maps), load, 0, source=maps)
+
+
+def _pooled(found: FeatureMap, labels: Tensor) -> FeatureMap:
+    return FeatureMap(pool(found.clip, labels), None if found.dino is None else pool(found.dino, labels))
 
 
 def pool(features: Tensor, labels: Tensor | Sequence[Tensor]) -> Tensor:

@@ -39,6 +39,8 @@ NO_TEMPLATE = ("{}",)
 
 _CHUNK = 1 << 13  # pixels per block; small enough for a block to stay in the cache
 _GAUSSIANS = 1 << 16  # Gaussians per block, so that [N, K] is never held
+_PEAK_SHARE, _PEAK_COUNT = 5e-4, 20
+"""The peak of a level is the mean of its best 0.05 percent of the Gaussians, and of at least this many."""
 
 QueryForm = Literal["segment", "code", "feature"]
 """How text is compared with the scene (`QueryConfig.form`)."""
@@ -293,6 +295,9 @@ def render_relevancy(
     Returns:
         ``[P, H, W]`` in 0..1, on the device of the Gaussians.
     """
+    if field.levels:
+        maps = [render_relevancy(level, gaussians, camera, question) for level in field.levels]
+        return _of_best_level(maps, [gaussian_relevancy(level, question) for level in field.levels])
     codewords = field.codebook.clip.to(gaussians.device)
     if question.config.form == "feature":
         probabilities = field.render_code_probabilities(gaussians, camera)
@@ -304,7 +309,13 @@ def render_relevancy(
 
 @torch.no_grad()
 def gaussian_relevancy(field: LanguageField, question: Question) -> Tensor:
-    """Relevancy of every prompt for every Gaussian ``[P, N]`` in 0..1; 0 for Gaussians that no view saw."""
+    """Relevancy of every prompt for every Gaussian ``[P, N]`` in 0..1; 0 for Gaussians that no view saw.
+
+    Of a field with levels of 2D segments, the level with the highest peak answers a prompt, as in LangSplat.
+    """
+    if field.levels:
+        own = [gaussian_relevancy(level, question) for level in field.levels]
+        return _of_best_level(own, own)
     if question.config.form != "feature":
         scores = field.scores(code_relevancy(field.codebook.clip, question))
         return scores.T.clamp(0.0, 1.0).contiguous()
@@ -315,6 +326,19 @@ def gaussian_relevancy(field: LanguageField, question: Question) -> Tensor:
         for rows in map(field.select, index.split(_GAUSSIANS))
     ]
     return torch.cat(blocks, dim=1).contiguous()
+
+
+def _of_best_level(answers: Sequence[Tensor], relevancies: Sequence[Tensor]) -> Tensor:
+    """For each prompt the answer of the level whose Gaussians reach the highest peak.
+
+    Args:
+        answers: ``[P, ...]`` of each level.
+        relevancies: Relevancy of the Gaussians ``[P, N]`` at each level.
+    """
+    own = torch.stack(list(relevancies))
+    count = min(own.shape[2], max(_PEAK_COUNT, int(_PEAK_SHARE * own.shape[2])))
+    best = own.topk(count, dim=2).values.sum(2).argmax(0)
+    return torch.stack(list(answers))[best, torch.arange(len(best), device=best.device)]
 
 
 def _unit_texts(texts: Tensor, like: Tensor, name: str) -> Tensor:

@@ -52,6 +52,7 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "codes": codes.get("codes"),
         "codes_used": codes.get("codes_used"),
         "segments": language.get("segments"),
+        "language_levels": language.get("levels", 1) if language else None,
         "unseen": language.get("unseen"),
         "method": language.get("method"),
         "clip": config.get("clip"),

@@ -38,6 +38,8 @@ class CodeField:
         uncertainties: u_G ``[N]`` in 0..1.
         method: Name of the method that made the field.
         segments: The segments of the Gaussians; None for a field without.
+        num_levels: Number L of levels of 2D segments whose language is kept apart. Each level has T / L of the codes,
+            one level after the other, and 1 / L of the weight.
     """
 
     def __init__(
@@ -49,6 +51,7 @@ class CodeField:
         *,
         method: str = "averaged",
         segments: Segments | None = None,
+        num_levels: int = 1,
     ) -> None:
         if codes.ndim != 2 or codes.dtype != torch.uint8 or weights.shape != codes.shape:
             raise ValueError(
@@ -65,8 +68,11 @@ class CodeField:
             raise ValueError(f"code {int(codes.max())} is not in a codebook of {codebook.num_codes}")
         if segments is not None and len(segments.labels) != len(codes):
             raise ValueError(f"segments of {len(codes)} Gaussians expected, got {len(segments.labels)}")
+        if num_levels < 1 or codes.shape[1] % num_levels:
+            raise ValueError(f"{codes.shape[1]} codes of a Gaussian cannot be those of {num_levels} levels")
         self.codebook = codebook
         self.segments = segments
+        self.num_levels = num_levels
         self.codes = codes
         self.weights = weights.float()
         self.uncertainties = uncertainties.float()
@@ -76,6 +82,24 @@ class CodeField:
         count, kept = self.codes.shape
         return (
             f"CodeField({count:,} Gaussians, {kept} of {self.codebook.num_codes} codes each, {self.method!r})"
+        )
+
+    @property
+    def levels(self) -> tuple[CodeField, ...]:
+        """The field of each level of 2D segments; () where there is one level."""
+        if self.num_levels == 1:
+            return ()
+        parts = zip(self.codes.chunk(self.num_levels, 1), self.weights.chunk(self.num_levels, 1))
+        return tuple(
+            CodeField(
+                self.codebook,
+                codes,
+                torch.nn.functional.normalize(weights, p=1, dim=1),
+                self.uncertainties,
+                method=self.method,
+                segments=self.segments,
+            )
+            for codes, weights in parts
         )
 
     @property
@@ -144,12 +168,14 @@ class CodeField:
             self.uncertainties[index],
             method=self.method,
             segments=self.segments.select(index) if self.segments else None,
+            num_levels=self.num_levels,
         )
 
     def facts(self) -> dict[str, Any]:
         """How the likeliest codes are used, and how many Gaussians have none."""
-        first = self.codes[:, 0].cpu().numpy()
-        return {**code_usage([first], self.codebook.num_codes).facts(), "unseen": self.unseen}
+        first = torch.cat([codes[:, 0] for codes in self.codes.chunk(self.num_levels, 1)]).cpu().numpy()
+        used = code_usage([first], self.codebook.num_codes).facts()
+        return {**used, "unseen": self.unseen} | ({"levels": self.num_levels} if self.num_levels > 1 else {})
 
     def content(self) -> tuple[Tensor, ...]:
         """Codes, weights and codewords."""
@@ -158,7 +184,7 @@ class CodeField:
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, for safetensors; those of the codebook under ``codebook.``.
 
-        Weights and uncertainties have 8 bits: 9 bytes a Gaussian with four codes.
+        Weights and uncertainties have 8 bits: 9 bytes a Gaussian with four codes, and 8 for each further level.
         """
         uncertainties = (self.uncertainties.clamp(0, 1) * _STEPS).round().to(torch.uint8)
         own = {"codes": self.codes, "weights": _in_steps(self.weights), "uncertainties": uncertainties}
@@ -167,7 +193,8 @@ class CodeField:
 
     def metadata(self) -> dict[str, str]:
         """Everything that is not a tensor."""
-        return {"kind": "codes", "method": self.method}
+        levels = {"levels": str(self.num_levels)} if self.num_levels > 1 else {}
+        return {"kind": "codes", "method": self.method} | levels
 
     @classmethod
     def from_tensors(
@@ -188,6 +215,7 @@ class CodeField:
             _as_floats(tensors["uncertainties"]),
             method=(metadata or {}).get("method", "averaged"),
             segments=Segments.from_tensors(tensors),
+            num_levels=int((metadata or {}).get("levels", "1")),
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -25,6 +26,14 @@ class LanguageField(Protocol):
     codebook: Codebook
     segments: Segments | None
     """The segments of the Gaussians; None for a field without."""
+
+    @property
+    def levels(self) -> Sequence[LanguageField]:
+        """The language of each level of 2D segments where it is kept apart; () for a field of one level.
+
+        Prompts are answered by the level that fits best (`lexsplat.queries.relevancy`); the field itself is the mean
+        of its levels.
+        """
 
     @property
     def uncertainties(self) -> Tensor:

@@ -47,6 +47,7 @@ class TrainedField(nn.Module):
     """
 
     segments: Segments | None = None
+    levels = ()
 
     def __init__(
         self,

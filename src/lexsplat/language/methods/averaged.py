@@ -11,6 +11,9 @@ the transpose of rendering (as in LUDVIG and Occam's LGS). Averaging cancels wha
 codebook is then fitted to the Gaussians (Eq. 2 to 4; without the DINO half unless asked for), and each Gaussian
 carries a softmax over its nearest codes. The length of the mean of unit vectors measures how far the views agree,
 which gives u_G: 0 for a mean of length 1, and 1 for a mean no longer than that of all features of the scene.
+
+Where photos have several levels of 2D segments (`lexsplat.features.segments2d`), each Gaussian has a mean and codes
+at each level, from one codebook. u_G is the mean over the levels.
 """
 
 from __future__ import annotations
@@ -215,6 +218,7 @@ def field_from_means(
     Raises:
         MemoryBudgetError: If the sample does not fit.
     """
+    levels, found = found.levels, found.apart()
     device, (count, dimensions) = found.totals.device, found.means.shape
     looked_at = min(codebook_config.sample_size, count)
     what, number = f"a sample of {looked_at:,} Gaussians", codebook_config.num_codes
@@ -236,7 +240,14 @@ def field_from_means(
             agreement[rows] = ((halves[0].square().sum(-1) - shared) / (1 - shared)).clamp(0, 1)
     trusted = found.totals / (found.totals + config.prior_visibility).clamp_min(1e-12)
     uncertainties = torch.where(visible, 1 - agreement * trusted, torch.ones_like(trusted))
-    return CodeField(Codebook(codewords), codes, weights, uncertainties, method="averaged")
+    return CodeField(
+        Codebook(codewords),
+        codes.reshape(-1, levels * kept),
+        weights.reshape(-1, levels * kept) / levels,
+        uncertainties.reshape(-1, levels).mean(1),
+        method="averaged",
+        num_levels=levels,
+    )
 
 
 def _fit(

@@ -52,27 +52,37 @@ class MeanFeatures:
     """The mean feature of each Gaussian over the training views.
 
     Args:
-        means: ``[N, Dc + Dd]`` float16, each half of length at most 1; 0 for Gaussians that were not seen. In memory
-            or in a file.
+        means: ``[N, L (Dc + Dd)]`` float16, each half of length at most 1; 0 for Gaussians that were not seen. In
+            memory or in a file.
         totals: Sum of the weights of all pixels ``[N]``, in cells of the feature maps.
         dino: Size Dd of the DINO half; 0 without.
+        levels: Number L of levels of 2D segments with means of their own, side by side in a row.
     """
 
     means: NDArray[np.float16]
     totals: Tensor
     dino: int = 0
+    levels: int = 1
+
+    def apart(self) -> MeanFeatures:
+        """The same with a row for each level of each Gaussian, N L rows."""
+        rows = self.means.reshape(len(self.means) * self.levels, -1)
+        return MeanFeatures(rows, self.totals.repeat_interleave(self.levels), self.dino)
 
     def rows(self, index: slice | Tensor) -> Tensor:
-        """CLIP means of some Gaussians ``[n, Dc]`` float32, on the device of `totals`."""
+        """CLIP means of some Gaussians ``[n, L Dc]`` float32, on the device of `totals`."""
         return self.halves(index)[0]
 
     def halves(self, index: slice | Tensor) -> list[Tensor]:
-        """The same, followed by the DINO means ``[n, Dd]`` if there are any."""
+        """The same, followed by the DINO means ``[n, L Dd]`` if there are any."""
         means = torch.from_numpy(self.means)
         chosen = means[index] if isinstance(index, slice) else means.index_select(0, index.cpu())
         rows = chosen.float().to(self.totals.device)
-        clip = rows.shape[1] - self.dino
-        return [rows[:, :clip], rows[:, clip:]] if self.dino else [rows]
+        if not self.dino:
+            return [rows]
+        rows = rows.unflatten(1, (self.levels, -1))
+        clip = rows.shape[2] - self.dino
+        return [rows[..., :clip].flatten(1), rows[..., clip:].flatten(1)]
 
     def visible(self, config: AveragedConfig) -> Tensor:
         """Which Gaussians the training views show ``[N]`` bool."""
@@ -121,16 +131,17 @@ def average_features(
     names = sorted(cameras)
     check_views(names, feature_maps)
     gaussians, count = gaussians.detach(), len(gaussians)
-    dino = feature_maps[names[0]].dino if config.dino else None
-    with_dino = 0 if dino is None else dino.shape[-1]
-    dimensions = feature_maps[names[0]].clip.shape[-1] + with_dino
+    first = feature_maps[names[0]]
+    with_dino = first.dino.shape[-1] if config.dino and first.dino is not None else 0
+    dimensions, levels, nbytes = _features(first, with_dino).shape[-1], len(first.levels) or 1, first.nbytes
+    del first  # not held while the views are passed over
     device = gaussians.device if not workers.distributed else torch.device("cpu")
     ranges = list(_ranges(dimensions, count, sums_bound(device, memory)))
     means = _store(count, dimensions, sums_bound(torch.device("cpu"), memory), scratch)
     shards = view_shards(names)
     seen = _is_seen(workers, scratch)
     shared = _Averaging(gaussians, dict(cameras), feature_maps if seen else {}, config, valid, with_dino)
-    carried = 0 if seen else len(shards[0]) * feature_maps[names[0]].nbytes
+    carried = 0 if seen else len(shards[0]) * nbytes
     needs = Needs(gpu=gaussians.device.type == "cuda", result=4 * count * (len(ranges[0]) + 1) + carried)
     totals = torch.zeros(count, device=gaussians.device)
     done = 0
@@ -150,7 +161,7 @@ def average_features(
             rows = slice(start, start + ROWS)
             mean = sums[rows] / totals[rows, None].clamp_min(1e-12)
             means[rows, columns.start : columns.stop] = mean.cpu().numpy().astype(np.float16)
-    return MeanFeatures(means, totals, with_dino)
+    return MeanFeatures(means, totals, with_dino, levels)
 
 
 def _is_seen(workers: Workers, folder: Path | None) -> bool:
@@ -231,9 +242,7 @@ def _shard_sums(shared: _Averaging, item: _Shard) -> tuple[Tensor, Tensor, int]:
     totals = torch.zeros(len(gaussians), device=gaussians.device)
     for name in names:
         found = maps[name]
-        features = found.clip
-        if shared.with_dino and found.dino is not None:
-            features = torch.cat([features, found.dino], dim=-1)
+        features = _features(found, shared.with_dino)
         if features.shape[-1] != dimensions:
             raise ValueError(f"features of {name} have {features.shape[-1]} dimensions, others {dimensions}")
         camera = _at_map_size(shared.cameras[name], features, gaussians.antialiased, shared.config)
@@ -243,6 +252,14 @@ def _shard_sums(shared: _Averaging, item: _Shard) -> tuple[Tensor, Tensor, int]:
         if columns.start == 0:
             totals += weights.totals()
     return sums, totals, len(names)
+
+
+def _features(found: FeatureMap, with_dino: int) -> Tensor:
+    """What is averaged of a view ``[h, w, L (Dc + Dd)]``: CLIP and DINO features of each level."""
+    levels = found.levels or (found,)
+    halves = ((level.clip, level.dino) if with_dino else (level.clip,) for level in levels)
+    parts = [half for pair in halves for half in pair if half is not None]
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
 
 
 def _cell_weights(
