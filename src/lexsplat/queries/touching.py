@@ -26,7 +26,7 @@ _MOST = 6
 _FEWEST = 64
 """Points of a piece, at least: the shape of fewer is not known."""
 _SAMPLE = 600
-_ROUNDS = 6
+_ROUNDS = 4
 _STRAYS = 0.03
 """Share of the points of a piece that are left out of its hull: those farthest from its middle."""
 _END = 0.05
