@@ -1,7 +1,7 @@
 """A set of Gaussians with the scores that selected it: the result of a search in 3D.
 
 A `Selection` is immutable: ``a | b``, ``a - b``, ``a.grow()`` and the like make new ones. Its connected clusters are
-its *instances*: two mugs found by "mug" are one selection with two instances.
+its *instances*: two mugs found by "mug" are one selection with two instances, and so are two apples that touch.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.rotations import matrices_from_quaternions
 from lexsplat.geometry.world import World
 from lexsplat.queries.clusters import LINK, clusters, spacing
+from lexsplat.queries.touching import divided
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import QueryError
 
@@ -185,7 +186,10 @@ class Selection:
         return self.clusters(SMALLEST_SHARE)
 
     def clusters(self, smallest: float = 0.0) -> list[Selection]:
-        """All connected clusters with at least ``smallest`` times the opacity of the largest, largest first."""
+        """All clusters with at least ``smallest`` times the opacity of the largest, largest first.
+
+        A cluster is connected; things of one kind that touch are clusters of their own (`lexsplat.queries.touching`).
+        """
         labels, weights = self._clusters()
         if len(weights) == 1:
             return [self]
@@ -399,7 +403,8 @@ class Selection:
     def _clusters(self) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Cluster of each selected Gaussian ``[M]`` and the total opacity of each cluster ``[C]``."""
         points, opacities = self._points()
-        labels = clusters(points, opacities >= FAINT)
+        firm = opacities >= FAINT
+        labels = divided(points, firm, clusters(points, firm), self.up.direction)
         return labels, np.bincount(labels, weights=opacities).astype(np.float64)
 
 

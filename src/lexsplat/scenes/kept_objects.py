@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("lexsplat")
 
 FILE = "objects.safetensors"
-_VERSION = 2
+_VERSION = 3
 """Raised when the content is computed in another way."""
 
 
