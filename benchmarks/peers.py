@@ -13,8 +13,8 @@ is each trainer's own: learning rates, order of views, degrees of colors, densit
 process of its own. Repeats alternate the peers.
 
 The milliseconds of a step are medians after three steps. PSNR is that of the held-out views after all steps, rendered
-by lexsplat (for gsplat by itself) over the color that the peer trains over. Memory is the peak of the process, which for
-all but OpenSplat includes Python.
+by lexsplat (for gsplat by itself) over the color that the peer trains over. Memory is the peak of the process, which
+includes Python for all but OpenSplat.
 """
 
 from __future__ import annotations
