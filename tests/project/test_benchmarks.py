@@ -156,6 +156,26 @@ if sys.argv[1:]:
         opensplat.timed_steps(["/nowhere/opensplat"], threads=1)
 
 
+def test_peers_are_medians_of_repeats_and_absent_ones_have_a_reason(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import peers
+
+    found = iter([1.0, 5.0, 2.0])
+
+    def train(peer, options):
+        if peer == "OpenSplat":
+            return {"skipped": "no program"}
+        time = next(found) if peer == "naive" else 7.0
+        return {"processor_ms": time, "wall_ms": 9.0, "psnr": 20.0, "peak_bytes": 3e6, "gaussians": 1234}
+
+    monkeypatch.setattr(peers, "train_elsewhere", train)
+    monkeypatch.setattr(sys, "argv", ["peers.py"])
+    peers.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[3].split() == ["naive", "2.0", "9.0", "20.00", "3", "1,234"]
+    assert lines[4].split() == ["OpenSplat", "skipped:", "no", "program"]
+
+
 def test_operations_of_an_encoder_are_those_of_its_matrix_products(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
     import features
