@@ -4,6 +4,7 @@ import json
 import logging
 import runpy
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,118 @@ def test_the_peer_of_gsplats_torch_functions_renders_our_image(monkeypatch):
     assert (image - expected.image).abs().mean() < 2e-4
     assert (image - expected.image).abs().max() < 2e-2
     assert (alpha - expected.alpha).abs().max() < 2e-2
+
+
+def test_the_naive_port_renders_our_image(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import naive
+    from support.rendering_reference import front_camera, random_gaussians
+
+    gaussians, camera = random_gaussians(60, 0, degree=0), front_camera()
+    background = torch.tensor([0.1, 0.5, 0.9])
+    image = naive.draw(gaussians, camera, background)
+    expected = render(gaussians, camera, background=background).image
+    assert (image - expected).abs().max() < 1e-5
+
+
+def test_the_naive_ports_ssim_is_that_of_scikit_image_away_from_the_border(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import naive
+    from skimage.metrics import structural_similarity
+
+    image, photo = torch.rand(2, 24, 20, 3, generator=torch.Generator().manual_seed(0))
+    # Zeros around both images are equal there, as are images of 40 pixels more.
+    wide = [torch.nn.functional.pad(each, (0, 0, 20, 20, 20, 20)) for each in (image, photo)]
+    expected = structural_similarity(
+        *(each.numpy() for each in wide), data_range=1.0, channel_axis=2, gaussian_weights=True,
+        sigma=1.5, use_sample_covariance=False, full=True,
+    )[1]  # fmt: skip
+    assert abs(float(naive.ssim(image, photo)) - expected[20:-20, 20:-20].mean()) < 1e-5
+
+
+def test_the_naive_port_learns(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    from naive import NaiveTrainer
+
+    from lexsplat.captures import initial_points, load_capture
+    from lexsplat.evaluation.demo import demo_capture
+
+    capture = load_capture(demo_capture("second")).downscaled(8)
+    points = initial_points(capture)
+    fewer = replace(points, points=points.points[::16], colors=points.colors[::16])
+    trainer = NaiveTrainer(capture, fewer, 48)
+    losses = [trainer.step() for _ in range(48)]  # each of 24 views twice
+    assert np.mean(losses[24:]) < 0.9 * np.mean(losses[:24])
+
+
+def test_a_project_for_opensplat_holds_the_training_views_and_points(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import opensplat
+    from plyfile import PlyData
+
+    from lexsplat.captures import initial_points, load_capture
+    from lexsplat.evaluation.demo import demo_capture
+
+    capture = load_capture(demo_capture("second")).downscaled(5)
+    opensplat.write_project(tmp_path, capture, initial_points(capture))
+    read = load_capture(tmp_path)
+    assert len(read.views) == len(capture.train_names) == 24
+    vertices = PlyData.read(tmp_path / "points.ply")["vertex"]
+    assert np.allclose(np.stack([vertices[axis] for axis in "xyz"], 1), capture.points)
+    colors = np.stack([vertices[name] for name in ("red", "green", "blue")], 1) / 255
+    assert np.abs(colors - capture.point_colors).max() <= 0.5 / 255 + 1e-6
+    for view, found in zip(capture.train_views, read.views.values()):
+        assert np.allclose(found.camera.viewmat, view.camera.viewmat, atol=1e-6)
+        assert np.allclose(found.camera.K, view.camera.K)
+        assert np.abs(found.load_image() - view.load_image()).max() <= 0.5 / 255 + 1e-6
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the clock of another process as Linux has it")
+def test_steps_of_another_program_are_timed_and_its_failure_is_a_reason(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import opensplat
+
+    program = """
+import sys, time
+block = bytearray(64 << 20)
+for step in range(3):
+    print("Step", step, flush=True)
+    end = time.process_time() + 0.05
+    while time.process_time() < end:
+        pass
+    time.sleep(0.05)
+if sys.argv[1:]:
+    sys.exit("no such camera")
+"""
+    clocks, peak = opensplat.timed_steps([sys.executable, "-c", program], threads=1)
+    processor, wall = np.diff(clocks, axis=0).T
+    assert ((processor > 0.045) & (processor < 0.09)).all()
+    assert (wall > 0.095).all()
+    assert 64 << 20 < peak < 128 << 20
+    with pytest.raises(opensplat.Skipped, match="status 1: no such camera"):
+        opensplat.timed_steps([sys.executable, "-c", program, "fail"], threads=1)
+    with pytest.raises(opensplat.Skipped, match="does not start"):
+        opensplat.timed_steps(["/nowhere/opensplat"], threads=1)
+
+
+def test_peers_are_medians_of_repeats_and_absent_ones_have_a_reason(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import peers
+
+    found = iter([1.0, 5.0, 2.0])
+
+    def train(peer, options):
+        if peer == "OpenSplat":
+            return {"skipped": "no program"}
+        time = next(found) if peer == "naive" else 7.0
+        return {"processor_ms": time, "wall_ms": 9.0, "psnr": 20.0, "peak_bytes": 3e6, "gaussians": 1234}
+
+    monkeypatch.setattr(peers, "train_elsewhere", train)
+    monkeypatch.setattr(sys, "argv", ["peers.py"])
+    peers.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[3].split() == ["naive", "2.0", "9.0", "20.00", "3", "1,234"]
+    assert lines[4].split() == ["OpenSplat", "skipped:", "no", "program"]
 
 
 def test_operations_of_an_encoder_are_those_of_its_matrix_products(monkeypatch):
