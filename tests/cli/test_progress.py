@@ -12,7 +12,7 @@ from lexsplat.runtime.progress import Event, Pace
 
 
 @pytest.fixture
-def clock(monkeypatch):
+def clock(monkeypatch) -> list[float]:
     now = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     return now

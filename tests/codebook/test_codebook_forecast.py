@@ -12,7 +12,7 @@ READ, CLUSTERED, STEP, ASSIGNED = 2.0, 0.01, 0.5, 3.0
 
 
 @pytest.fixture
-def maps(monkeypatch):
+def timed_maps(monkeypatch):
     """Feature maps whose use moves the clock."""
     clock, generator = [0.0], torch.Generator().manual_seed(0)
 
@@ -40,28 +40,28 @@ def maps(monkeypatch):
 
 
 @pytest.mark.parametrize("kmeans", [True, False])
-def test_the_forecast_is_the_sum_over_views_features_and_steps(maps, kmeans):
+def test_the_forecast_is_the_sum_over_views_features_and_steps(timed_maps, kmeans):
     config = CodebookConfig(
         num_codes=4, use_dino=False, steps=100, sample_size=VIEWS * 10, init="kmeans" if kmeans else "uniform"
     )
     clustering = CLUSTERED * VIEWS * 10 if kmeans else 0.0
     expected = (READ + ASSIGNED) * VIEWS + clustering + STEP * 100
-    assert forecasting.forecast(maps, list(maps), config) == pytest.approx(expected)
+    assert forecasting.forecast(timed_maps, list(timed_maps), config) == pytest.approx(expected)
 
 
-def test_a_step_of_the_forecast_has_a_whole_batch(maps, monkeypatch):
+def test_a_step_of_the_forecast_has_a_whole_batch(timed_maps, monkeypatch):
     sizes, refine = [], forecasting.refine
     monkeypatch.setattr(
         forecasting, "refine", lambda clip, *rest: sizes.append(len(clip)) or refine(clip, *rest)
     )
     for batch in (64, 4096):
         config = CodebookConfig(num_codes=4, use_dino=False, batch_size=batch, sample_size=VIEWS * 10)
-        forecasting.forecast(maps, list(maps), config)
+        forecasting.forecast(timed_maps, list(timed_maps), config)
     assert sizes == [64, VIEWS * 10], "all features of the sample are fewer than the batch"
 
 
-def test_features_that_the_fit_refuses_are_told_nothing_of(maps, caplog):
-    for found in maps.values():
+def test_features_that_the_fit_refuses_are_told_nothing_of(timed_maps, caplog):
+    for found in timed_maps.values():
         found.clip.zero_()
-    forecasting.tell_codebook(maps, list(maps), CodebookConfig(num_codes=4, use_dino=False))
+    forecasting.tell_codebook(timed_maps, list(timed_maps), CodebookConfig(num_codes=4, use_dino=False))
     assert caplog.messages == []

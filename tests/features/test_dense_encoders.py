@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(autouse=True)
-def full_precision(monkeypatch):
+def full_precision(monkeypatch) -> None:
     monkeypatch.setattr("lexsplat.features.pretrained.bfloat16_is_faster", lambda: False)
 
 

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(autouse=True)
-def full_precision(request, monkeypatch):
+def full_precision(request, monkeypatch) -> None:
     """Bfloat16 is tested separately; everything else is compared at full precision."""
     if "bfloat16" not in request.node.name:
         monkeypatch.setattr("lexsplat.features.pretrained.bfloat16_is_faster", lambda: False)

@@ -207,7 +207,7 @@ def exact(tmp_path_factory) -> Path:
 def test_wrong_segments_are_reported_before_structure_from_motion_and_reconstruction(
     tiny_capture, exact, tmp_path, monkeypatch, change, told
 ):
-    for late in ("build.reconstruct", "inputs.poses_from_photos"):
+    for late in ("geometry.reconstruct", "inputs.poses_from_photos"):
         monkeypatch.setattr(f"lexsplat.pipeline.{late}", lambda *_, **__: pytest.fail("too late"))
     folder = shutil.copytree(exact, tmp_path / "segments")
     change(folder / "view_03.png")

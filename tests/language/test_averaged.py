@@ -8,15 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from support.language_scene import IGNORED, LanguageScene, label_accuracy, make_scene
+from support.language_scene import LanguageScene, label_accuracy, make_scene
 from support.rendering_reference import blend, front_camera, project, random_gaussians, to_float64
 from torch.nn.functional import normalize
 
 from lexsplat.codebook import CodebookConfig
 from lexsplat.features import FeatureMap, FeatureMaps
-from lexsplat.features.segments2d import pool
 from lexsplat.language.fields import CodeField
-from lexsplat.language.methods import METHODS, averaged, averaging
+from lexsplat.language.methods import METHODS, averaging
 from lexsplat.language.methods.averaged import (
     AveragedConfig,
     features_of_codes,
@@ -25,12 +24,9 @@ from lexsplat.language.methods.averaged import (
 from lexsplat.language.methods.averaging import MeanFeatures, average_features, sums_bound
 from lexsplat.language.methods.method import FitRun, TrainingViews
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.queries.relevancy import QueryConfig, Question, gaussian_relevancy
-from lexsplat.queries.scoring import scores_in_form
 from lexsplat.queries.visibility import hidden_gaussians
 from lexsplat.runtime.errors import MemoryBudgetError, TaskError
 from lexsplat.runtime.memory import parse_bytes
-from lexsplat.runtime.progress import NOTE
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -137,69 +133,6 @@ def test_levels_are_averaged_apart_with_their_halves(small) -> None:
         halves = rows.halves(torch.arange(level, 2 * count, 2))
         for half, expected in zip(halves, alone[2 * level :]):
             np.testing.assert_array_equal(half, expected.astype(np.float32))
-
-
-@pytest.fixture(scope="module")
-def parts_and_things(balls) -> tuple[CodeField, CodeField]:
-    """Balls 0 and 1 are parts of one thing: exact masks of parts and of things, kept apart and as one level."""
-    rng = torch.Generator().manual_seed(0)
-    maps, means = {}, {}
-    for name, labels in balls.code_maps.items():
-        parts = torch.from_numpy(np.where(labels == IGNORED, -1, labels.astype(int)))
-        things = torch.where(parts == 1, 0, parts)
-        features = torch.eye(6)[parts] + 0.3 * torch.randn(*parts.shape, 6, generator=rng)
-        features = normalize(features, dim=-1) * (parts >= 0)[..., None]
-        levels = torch.stack([parts, things])
-        means[name] = FeatureMap(pool(features, levels))
-        maps[name] = FeatureMap(
-            means[name].clip, levels=tuple(FeatureMap(pool(features, level)) for level in levels.split(1))
-        )
-    views = {
-        name: SimpleNamespace(camera=camera, load_valid=lambda size: None)
-        for name, camera in balls.cameras.items()
-    }
-    config = BuildConfig(codebook=replace(CODES, num_codes=20))
-    kept, mixed = (
-        METHODS["averaged"].fit(balls.gaussians, TrainingViews(views, features=each), config, FitRun())
-        for each in (maps, means)
-    )
-    return kept, mixed
-
-
-@pytest.mark.parametrize("form", ["code", "segment"])
-def test_a_part_is_answered_from_the_level_of_parts_and_a_thing_from_that_of_things(
-    balls, parts_and_things, form
-) -> None:
-    kept, mixed = parts_and_things
-    thing = normalize(torch.eye(6)[0] + torch.eye(6)[1], dim=0)
-    query = QueryConfig(form=form, temperature=2.0)
-    question = Question(torch.stack([torch.eye(6)[0], thing]), torch.eye(6)[5:], query)
-    inside = torch.from_numpy(np.stack([balls.labels == 0, balls.labels <= 1]))
-    own = gaussian_relevancy(kept, question)
-    for prompt, level in enumerate(kept.levels):
-        torch.testing.assert_close(own[prompt], gaussian_relevancy(level, question)[prompt])
-    scores = scores_in_form(kept, query, own, ["yes", "yes"])
-    for row, mask in zip(scores, inside):
-        limit = 0.5 if form == "segment" else 0.75
-        assert ((row >= limit) == mask).float().mean() > 0.97
-    # One mean of both levels resembles neither the part nor the thing as much.
-    worse = gaussian_relevancy(mixed, question)
-    for row, other, mask in zip(own, worse, inside):
-        assert float(row[mask].median()) > float(other[mask].median())
-
-
-def test_levels_do_not_mix_where_part_and_thing_differ(balls, parts_and_things) -> None:
-    kept, mixed = parts_and_things
-
-    def of_the_other(field: CodeField) -> float:
-        """Median cosine of the first ball's Gaussians with the second ball."""
-        features = field.code_probabilities()[torch.from_numpy(balls.labels == 0)] @ field.codebook.clip
-        return float(normalize(features, dim=-1)[:, 1].median())
-
-    parts, things = kept.levels
-    assert of_the_other(parts) < 0.1
-    assert of_the_other(things) > 0.3
-    assert 0.15 < of_the_other(mixed) < 0.3, "one mean lies between them"
 
 
 def test_cells_without_a_feature_are_ignored(small) -> None:
@@ -501,45 +434,3 @@ def test_missing_views_and_other_dimensions_are_refused(small) -> None:
 def test_bad_settings_are_refused(bad) -> None:
     with pytest.raises(ValueError, match="must"):
         AveragedConfig(**bad)
-
-
-def test_the_time_is_that_of_a_few_views_and_gaussians_and_they_leave_no_trace(
-    balls, monkeypatch, caplog
-) -> None:
-    """The clock counts views and Gaussians; whatever runs first loads kernels."""
-    clock, seen, count = [0.0], set(), len(balls.gaussians)
-
-    def timed(name, seconds):
-        work = getattr(averaged, name)
-
-        def slow(*inputs, **options):
-            clock[0] += seconds(*inputs) + (0.0 if name in seen else 1000.0)
-            seen.add(name)
-            return work(*inputs, **options)
-
-        monkeypatch.setattr(averaged, name, slow)
-
-    views = TrainingViews(
-        {
-            name: SimpleNamespace(camera=camera, load_valid=lambda size: None)
-            for name, camera in balls.cameras.items()
-        },
-        features=features_of_codes(balls.code_maps, balls.codebook),
-    )
-    config = BuildConfig(codebook=CODES)
-    silent = METHODS["averaged"].fit(balls.gaussians, views, config, FitRun())
-    timed("average_features", lambda gaussians, cameras, *_: 5.0 * len(cameras))
-    timed("field_from_means", lambda found, *_: 0.03 * len(found.means))
-    timed("make_segments", lambda gaussians, *_: 0.01 * len(gaussians))
-    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
-    monkeypatch.setattr(averaged, "_TOLD_FROM", 1)
-    monkeypatch.setattr(averaged, "_SAMPLE", 50)
-    with caplog.at_level(NOTE, "lexsplat"):
-        told = METHODS["averaged"].fit(balls.gaussians, views, config, FitRun())
-    seconds = round(5.0 * len(views.views) + 0.04 * count)
-    length = f"{seconds // 60}:{seconds % 60:02} min"
-    assert caplog.messages == [
-        f"language: about {length} for {len(views.views)} views and {count:,} Gaussians"
-    ]
-    for name, tensor in silent.tensors().items():
-        assert torch.equal(tensor, told.tensors()[name]), name

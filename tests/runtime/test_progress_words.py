@@ -6,7 +6,7 @@ from lexsplat.runtime.progress import NOTE, Event, FirstUnits, duration, tell, u
 
 
 @pytest.fixture
-def clock(monkeypatch):
+def clock(monkeypatch) -> list[float]:
     now = [100.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     return now

@@ -23,7 +23,7 @@ from scipy.spatial import ConvexHull, QhullError
 from lexsplat.geometry.boxes import upright_frame
 
 _MOST = 6
-_FEWEST = 64
+_FEWEST = 128
 """Points of a piece, at least: the shape of fewer is not known."""
 _SAMPLE = 600
 _ROUNDS = 4
