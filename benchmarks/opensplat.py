@@ -69,12 +69,17 @@ def timed_steps(command: list[str], threads: int) -> tuple[NDArray, int]:
     clock, status = (~process.pid << 3) | 2, Path(f"/proc/{process.pid}/status")
     clocks, peak, last = [], 0, "nothing printed"
     assert process.stdout is not None
-    for line in process.stdout:
-        last = line.strip() or last
-        if line.startswith("Step "):
-            clocks.append((time.clock_gettime(clock), time.perf_counter()))
-            found = re.search(r"^VmHWM:\s*(\d+) kB", status.read_text(), flags=re.MULTILINE)
-            peak = 1024 * int(found[1]) if found else peak
+    try:
+        for line in process.stdout:
+            last = line.strip() or last
+            if line.startswith("Step "):
+                clocks.append((time.clock_gettime(clock), time.perf_counter()))
+                found = re.search(r"^VmHWM:\s*(\d+) kB", status.read_text(), flags=re.MULTILINE)
+                peak = 1024 * int(found[1]) if found else peak
+    except BaseException:
+        process.kill()
+        process.wait()
+        raise
     if process.wait() != 0:
         raise Skipped(f"it ended with status {process.returncode}: {last}")
     if not clocks:

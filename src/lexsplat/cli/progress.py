@@ -68,6 +68,7 @@ class ProgressBars:
             TimeRemainingColumn(),
             TextColumn("[dim]{task.fields[metrics]}"),
             console=self.console,
+            redirect_stdout=sys.stdout.isatty(),  # what is piped is data and stays on standard output
             disable=not self.console.is_terminal,
         )
 
@@ -107,7 +108,8 @@ class ProgressBars:
             self._progress.reset(task.id, description=title)
         if event.stage in self._began:
             task.start_time = self._began.pop(event.stage)
-        self._progress.update(task.id, completed=event.done, total=total, metrics=text)
+        task.total = total  # `update` keeps the old one where it gets None
+        self._progress.update(task.id, completed=event.done, metrics=text)
 
     def _print_line(self, event: Event, text: str) -> None:
         now, rate = time.monotonic(), self._pace.rate(event)

@@ -64,7 +64,7 @@ def fit_codebook(
     generator = torch.Generator(device="cpu").manual_seed(seed)
     total = config.steps + 1
     listener(Event("codebook", 0, total))
-    _check_sample(feature_maps[names[0]], len(names), config, memory)
+    check_sample(feature_maps[names[0]], len(names), config, memory)
     clip, dino = sample_features(feature_maps, names, config, generator=generator)
     clip, dino = clip.to(device), None if dino is None else dino.to(device)
     lambda_dino = config.lambda_dino
@@ -170,7 +170,7 @@ class _Rows:
         return kept.div_(kept.norm(dim=-1, keepdim=True).clamp_min(1e-12))
 
 
-def _check_sample(first: FeatureMap, views: int, config: CodebookConfig, memory: int) -> None:
+def check_sample(first: FeatureMap, views: int, config: CodebookConfig, memory: int) -> None:
     """Refuse a sample of ``views`` maps of the size of ``first`` that needs more than three quarters of the memory.
 
     Raises:

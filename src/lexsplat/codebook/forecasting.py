@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, TypeVar
 
 import torch
 
-from lexsplat.codebook.fitting import refine, sample_features, spherical_kmeans
+from lexsplat.codebook.fitting import check_sample, refine, sample_features, spherical_kmeans
 from lexsplat.codebook.settings import CodebookConfig
 from lexsplat.codebook.space import Codebook
+from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import one_thread
 from lexsplat.runtime.errors import TrainingError
 from lexsplat.runtime.progress import Listener, silent, tell, uncounted
@@ -33,9 +34,16 @@ def tell_codebook(
     feature_maps: Mapping[str, FeatureMap],
     names: Sequence[str],
     config: CodebookConfig,
+    *,
+    memory: int = budget.DEFAULT_MEMORY,
     listener: Listener = silent,
 ) -> None:
-    """Log how long the codebook will take (`forecast`); the listener receives events of stage "calibrate"."""
+    """Log how long the codebook will take (`forecast`); the listener receives events of stage "calibrate".
+
+    Raises:
+        MemoryBudgetError: If the sample does not fit into ``memory``, as in the fit.
+    """
+    check_sample(feature_maps[names[0]], len(names), config, memory)
     with contextlib.suppress(ValueError, TrainingError):  # features that the fit refuses
         with uncounted(listener, "calibrate"):
             seconds = forecast(feature_maps, names, config)

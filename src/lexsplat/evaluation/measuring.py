@@ -214,8 +214,15 @@ class _Evaluation:
             prompts = [prompt for prompt, mask in ground_truth.items() if mask.shape == size]
             relevancy |= self._at_size(view.camera, size, {prompt: working[prompt] for prompt in prompts})
 
+        silhouettes = {
+            prompt: self._silhouette(view.camera, prompt, mask)
+            for prompt, mask in ground_truth.items()
+            if prompt in self.selected
+        }
+
         def measured(prompt: str) -> PairResult:
-            return self._pair(view, prompt, relevancy[prompt], working[prompt], ground_truth[prompt])
+            maps = relevancy[prompt], working[prompt], ground_truth[prompt]
+            return self._pair(view, prompt, *maps, silhouettes.get(prompt))
 
         with ThreadPoolExecutor(kernel_threads()) as pool:  # counting and sorting release the GIL
             self.pairs[view.name] = dict(zip(ground_truth, pool.map(measured, ground_truth)))
@@ -228,6 +235,7 @@ class _Evaluation:
         relevancy: NDArray[np.float32],
         working: NDArray[np.float32],
         mask: NDArray[np.bool_],
+        silhouette: float | None,
     ) -> PairResult:
         """One prompt in one view: ``relevancy`` at the size of the ground truth, ``working`` at the working size."""
         asked, thresholds = self.config.protocols, self.thresholds[prompt]
@@ -239,7 +247,7 @@ class _Evaluation:
             localization(relevancy, mask),
             official_scores(working, mask, thresholds["fixed"]) if "official" in asked else None,
             lerf_2d_scores(relevancy, mask, boxes) if "lerf-2d" in asked and mask.any() else None,
-            self._silhouette(view.camera, prompt, mask) if prompt in self.selected else None,
+            silhouette,
         )
 
     @torch.no_grad()

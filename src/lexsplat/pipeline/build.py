@@ -278,7 +278,7 @@ class _Builder:
     def _fit_codebook(self) -> dict[str, Any]:
         maps, names = self._feature_maps(), self.capture.train_names
         seed, memory = self.config.seed, self.config.memory_bytes
-        tell_codebook(maps, names, self.config.codebook, self.listener)
+        tell_codebook(maps, names, self.config.codebook, memory=memory, listener=self.listener)
         codebook = fit_codebook(
             maps, names, self.config.codebook, seed=seed, memory=memory, listener=self.listener
         )

@@ -335,10 +335,13 @@ def _of_best_level(answers: Sequence[Tensor], relevancies: Sequence[Tensor]) -> 
         answers: ``[P, ...]`` of each level.
         relevancies: Relevancy of the Gaussians ``[P, N]`` at each level.
     """
-    own = torch.stack(list(relevancies))
-    count = min(own.shape[2], max(_PEAK_COUNT, int(_PEAK_SHARE * own.shape[2])))
-    best = own.topk(count, dim=2).values.sum(2).argmax(0)
-    return torch.stack(list(answers))[best, torch.arange(len(best), device=best.device)]
+    number = relevancies[0].shape[1]
+    count = min(number, max(_PEAK_COUNT, int(_PEAK_SHARE * number)))
+    peaks = torch.stack([own.topk(count, dim=1).values.sum(1) for own in relevancies])
+    found = answers[0].clone()
+    for prompt, level in enumerate(peaks.argmax(0).tolist()):
+        found[prompt] = answers[level][prompt]
+    return found
 
 
 def _unit_texts(texts: Tensor, like: Tensor, name: str) -> Tensor:

@@ -63,12 +63,15 @@ def divided(points: FloatArray, firm: NDArray[np.bool_], labels: IntArray, up: F
     Returns:
         The cluster of each point ``[M]``, numbered from 0; the first piece keeps the number of its cluster.
     """
-    for label in np.flatnonzero(np.bincount(labels[firm]) >= 2 * _FEWEST):
-        members = np.flatnonzero(labels == label)
-        upright = points[members] @ np.stack(upright_frame(up)).T
-        found = _pieces(upright, firm[members])
-        labels = labels.copy() if found.any() else labels
-        labels[members[found > 0]] = labels.max() + found[found > 0]
+    order, ends = np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))
+    known, number = labels, len(ends)
+    for label in np.flatnonzero(np.bincount(known[firm]) >= 2 * _FEWEST):
+        members = order[ends[label - 1] if label else 0 : ends[label]]
+        found = _pieces(points[members] @ np.stack(upright_frame(up)).T, firm[members])
+        if found.any():
+            labels = labels.copy() if labels is known else labels
+            labels[members[found > 0]] = number - 1 + found[found > 0]
+            number += int(found.max())
     return labels
 
 

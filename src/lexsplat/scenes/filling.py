@@ -161,11 +161,13 @@ def fill_for(
     """
     gone = chosen.mask.cpu().numpy().copy()
     things, found = chosen.instances, list[Fill]()
-    for done, thing in enumerate(things):
-        listener(Event("fill", done, len(things)))
-        fill = _fill_below(thing, gone, cameras)
-        found += [] if fill is None else [fill]
-    listener(Event("fill", len(things), len(things)))
+    try:
+        for done, thing in enumerate(things):
+            listener(Event("fill", done, len(things)))
+            fill = _fill_below(thing, gone, cameras)
+            found += [] if fill is None else [fill]
+    finally:  # a viewer goes on after an error, and its bar ends
+        listener(Event("fill", len(things), len(things)))
     mask = torch.from_numpy(gone).to(chosen.mask.device)
     if not found:
         return None, mask

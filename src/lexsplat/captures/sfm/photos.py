@@ -152,16 +152,18 @@ def poses_from_photos(
     names, total = photos.names, 2 * len(photos.names) + 1
     work = _work_folder(output, photos, config, seed)
     database = work / "database.db"
-
+    is_new = not database.exists()  # what an earlier run has done took no time in this one
     tell_features, tell_pairs = FirstUnits("SIFT features", "photos"), FirstUnits(MATCHING, "pairs")
 
     def report(done: int) -> None:
         _report(listener, photos, done)
-        tell_features(done, len(names))
+        if is_new:
+            tell_features(done, len(names))
 
     def report_pairs(done: int, pairs: int) -> None:
         listener(Event(MATCHING, done, pairs))
-        tell_pairs(done, pairs)
+        if is_new:
+            tell_pairs(done, pairs)
 
     with quiet_pycolmap(seed):
         report(0)

@@ -138,7 +138,12 @@ class CodeField:
 
     def likeliest_codes(self) -> tuple[Tensor, Tensor]:
         """The most probable code of every Gaussian ``[N]``, and whether a training view shows it ``[N]``."""
-        weights, place = self.weights.max(1)
+        # Levels may share a code.
+        shared = [
+            torch.where(self.codes == self.codes[:, [column]], self.weights, 0.0).sum(1)
+            for column in range(self.codes.shape[1])
+        ]
+        weights, place = torch.stack(shared, 1).max(1)
         return self.codes.gather(1, place[:, None])[:, 0].long(), weights > 0
 
     @torch.no_grad()

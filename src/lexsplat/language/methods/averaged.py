@@ -63,7 +63,8 @@ class AveragedConfig:
         min_visibility: Gaussians with less weight than this over all training views, in cells of the feature maps,
             count as never seen.
         prior_visibility: Weight in cells at which a Gaussian's mean is half trusted; below it u tends to 1.
-        shortest_side: Views are rendered at the size of their feature maps, but not below this many pixels.
+        shortest_side: Views are rendered at the size of their feature maps, but not below this many pixels on the
+            short side, and reduced by at most `lexsplat.language.methods.averaging.MOST_REDUCED`.
         dino: Average DINO features, too, and compare Gaussians with codes by both halves (Eq. 4).
         segments: Whether to find segments (`lexsplat.language.segments`), by which questions are answered.
     """
@@ -164,7 +165,8 @@ def _forecast(gaussians: Gaussians, views: TrainingViews, config: Any, run: FitR
     if not len(chosen):
         listener(Event("calibrate", 4, 4))
         return averaging
-    part = MeanFeatures(found.means[chosen.numpy()], found.totals[chosen.to(found.totals.device)], found.dino)
+    totals = found.totals[chosen.to(found.totals.device)]
+    part = replace(found, means=found.means[chosen.numpy()], totals=totals)
     share = len(chosen) / count
     codebook = replace(config.codebook, sample_size=max(1, round(config.codebook.sample_size * share)))
     sample = gaussians.select(chosen.to(gaussians.device))

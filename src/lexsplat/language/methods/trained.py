@@ -106,16 +106,18 @@ def train_field(
     """
     check_views(sorted(cameras), code_maps)
     if config.iterations >= _TOLD_FROM:
-        some = dict(evenly(sorted(cameras.items()), _FIRST + _STEPS))
-        calibrated = FieldTrainer(gaussians, codebook, config, seed=seed)
-        views = _prepare_views(calibrated.gaussians, some, config, memory)
-        training = _FrozenGeometryTraining(calibrated, views, code_maps)
 
         def report(done: int) -> None:
             listener(Event("calibrate", done, _FIRST + _STEPS))
 
+        def of_few_views() -> _FrozenGeometryTraining:  # freed after its last step
+            some = dict(evenly(sorted(cameras.items()), _FIRST + _STEPS))
+            trainer = FieldTrainer(gaussians, codebook, config, seed=seed)
+            views = _prepare_views(trainer.gaussians, some, config, memory)
+            return _FrozenGeometryTraining(trainer, views, code_maps)
+
         report(0)
-        seconds = config.iterations * time_steps(training, _FIRST, _STEPS, report)
+        seconds = config.iterations * time_steps(of_few_views(), _FIRST, _STEPS, report)
         tell("language", seconds, f"{config.iterations:,} iterations")
     trainer = FieldTrainer(gaussians, codebook, config, seed=seed)
     views = _prepare_views(trainer.gaussians, cameras, config, memory)

@@ -74,7 +74,7 @@ def find_floaters(
         subject: The file, for the warning.
         up: The up direction; None estimates it.
         seed: Seed of samples.
-        listener: Receives events of stage "floaters" in each search, one unit a view.
+        listener: Receives events of stage "floater views" in each search, one unit a view.
     """
     relative, own = isolation(gaussians)
     alone = np.minimum(relative, own)
@@ -138,13 +138,14 @@ def _before_surfaces(
     before, on = (np.zeros(len(suspects), np.int64) for _ in range(2))
     cameras = _cameras(_select(gaussians, solid), up, seed, generator)
     for done, camera in enumerate(cameras):
-        listener(Event("floaters", done, len(cameras)))
+        listener(Event("floater views", done, len(cameras)))
         for part in np.unique(parts):
             members = np.flatnonzero(parts == part)
             gaps, depths = _gaps(rest[part], camera, points[members])
             margins = np.clip(np.where(engulfing, 0, radii)[members, None] / depths, *_SAME_DEPTH)
             before[members] += (gaps > margins).sum(1)
             on[members] += (np.abs(gaps) <= margins).sum(1)
+    listener(Event("floater views", len(cameras), len(cameras)))
     least = np.where(engulfing, _PIERCED, _IN_FRONT)
     return suspects[(before >= _LEAST) & (before >= least * (before + on))]
 

@@ -49,7 +49,8 @@ def capture_of_splats(
         folder: The scene folder.
         config: Settings of the build, of which the up direction, the seed, and those of the views are read.
         device: Device to render on.
-        listener: Receives events of the stages "splats" (reading), "floaters" and those of `choose_views`.
+        listener: Receives events of the stages "splats" (reading), "floaters", "floater views" and those
+            of `choose_views`.
 
     Raises:
         FileFormatError: If the file is missing or damaged.
