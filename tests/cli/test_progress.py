@@ -49,6 +49,26 @@ def test_bars_in_a_terminal_state_rate_and_time_left(monkeypatch):
     assert "psnr 20" in screen.getvalue()
 
 
+def test_what_is_printed_into_a_pipe_stays_on_standard_output_while_bars_show(monkeypatch, capsys):
+    screen = io.StringIO()
+    monkeypatch.setattr(progress, "Console", lambda **_: Console(file=screen, force_terminal=True))
+    with ProgressBars() as bars:
+        bars(Event("start", 0, 1))
+        print("usage: lexsplat build CAPTURE")
+    assert capsys.readouterr().out == "usage: lexsplat build CAPTURE\n"
+    assert "usage" not in screen.getvalue()
+
+
+def test_what_cannot_be_counted_pulses_after_a_counted_stage(monkeypatch):
+    monkeypatch.setattr(
+        progress, "Console", lambda **_: Console(file=io.StringIO(), force_terminal=True, width=120)
+    )
+    bars = ProgressBars()
+    bars(Event("calibrate", 24, 24))
+    bars(Event("calibrate", 0, 1))
+    assert [task.total for task in bars._progress.tasks] == [None]
+
+
 def test_a_stage_of_the_next_scene_starts_anew(clock, monkeypatch, capsys):
     screen = io.StringIO()
 
