@@ -39,13 +39,17 @@ def test_cells_cover_the_plane_once_with_equal_numbers_of_points(count, capture)
     np.testing.assert_allclose(numbers, 4000 / count, rtol=0.02)
 
 
+def assert_views_and_cells_are_shared_out(cut, made, count: int) -> None:
+    assert sorted(name for block in cut.blocks for name in block.views) == sorted(made.views)
+    assert max(len(b.views) for b in cut.blocks) - min(len(b.views) for b in cut.blocks) <= 1
+    assert sorted(cell for block in cut.blocks for cell in block.owned) == list(range(count))
+
+
 @pytest.mark.parametrize("count", [2, 3, 6])
 def test_each_view_belongs_to_one_block_and_each_cell_is_owned_by_one_that_trains_it(count, capture):
     made, places = street(capture)
     cut = cut_blocks(made, places, ground_axes(UP), count, deal=False)
-    assert sorted(name for block in cut.blocks for name in block.views) == sorted(made.views)
-    assert max(len(b.views) for b in cut.blocks) - min(len(b.views) for b in cut.blocks) <= 1
-    assert sorted(cell for block in cut.blocks for cell in block.owned) == list(range(count))
+    assert_views_and_cells_are_shared_out(cut, made, count)
     assert all(set(block.owned) <= set(block.trained) for block in cut.blocks)
 
 
@@ -81,9 +85,7 @@ def around(capture):
 def test_blocks_around_a_table_have_views_from_all_sides_and_train_all_cells(count, capture):
     made, places = around(capture)
     cut = cut_blocks(made, places, ground_axes(UP), count, deal=True)
-    assert sorted(name for block in cut.blocks for name in block.views) == sorted(made.views)
-    assert max(len(b.views) for b in cut.blocks) - min(len(b.views) for b in cut.blocks) <= 1
-    assert sorted(cell for block in cut.blocks for cell in block.owned) == list(range(count))
+    assert_views_and_cells_are_shared_out(cut, made, count)
     for block in cut.blocks:
         assert block.dealt
         assert block.trained == tuple(range(count))

@@ -14,6 +14,15 @@ def upstream(rendering, clear: torch.Tensor, seed: int = 0) -> tuple[torch.Tenso
     return image, torch.randn(rendering.alpha.shape, generator=g) * clear
 
 
+def differentiate(found, expected: dict[str, torch.Tensor]) -> None:
+    """Run one backward pass of the rendering and of the reference, with the same gradients of image and alpha."""
+    grad_image, grad_alpha = upstream(found, expected["clear"])
+    torch.autograd.backward((found.channels, found.alpha), (grad_image, grad_alpha))
+    torch.autograd.backward(
+        (expected["image"], expected["alpha"]), (grad_image.double(), grad_alpha.double())
+    )
+
+
 # ------------------------------------------------------------------------------------------------- the definition
 
 
@@ -36,11 +45,7 @@ def test_image_and_gradients_equal_the_float64_reference(antialiased, seed, degr
     assert (found.image - expected["image"])[clear].abs().max() < 5e-6
     assert (found.alpha - expected["alpha"])[clear].abs().max() < 5e-6
 
-    grad_image, grad_alpha = upstream(found, clear)
-    torch.autograd.backward((found.channels, found.alpha), (grad_image, grad_alpha))
-    torch.autograd.backward(
-        (expected["image"], expected["alpha"]), (grad_image.double(), grad_alpha.double())
-    )
+    differentiate(found, expected)
     for name in FIELDS:
         if leaves[name].numel():
             assert relative_error(getattr(gaussians, name).grad, leaves[name].grad) < 1e-5, name
@@ -77,12 +82,7 @@ def test_gradients_of_clamped_alpha_equal_the_float64_reference(antialiased):
     leaves = reference.to_float64(gaussians)
     expected = reference.render(leaves, camera, antialiased=antialiased, degree=3)
     assert int((expected["weights"].detach() > 0.998999).sum()) > 20
-    found = render(gaussians, camera)
-    grad_image, grad_alpha = upstream(found, expected["clear"])
-    torch.autograd.backward((found.channels, found.alpha), (grad_image, grad_alpha))
-    torch.autograd.backward(
-        (expected["image"], expected["alpha"]), (grad_image.double(), grad_alpha.double())
-    )
+    differentiate(render(gaussians, camera), expected)
     for name in FIELDS:
         assert relative_error(getattr(gaussians, name).grad, leaves[name].grad) < 1e-4, name
 
@@ -99,12 +99,7 @@ def test_gradients_behind_a_nearly_opaque_gaussian_are_as_exact_as_all_others(se
     leaves = reference.to_float64(gaussians)
     expected = reference.render(leaves, camera, antialiased=False, degree=3)
     assert float(expected["alpha"].detach().min()) > 0.99899
-    found = render(gaussians, camera)
-    grad_image, grad_alpha = upstream(found, expected["clear"])
-    torch.autograd.backward((found.channels, found.alpha), (grad_image, grad_alpha))
-    torch.autograd.backward(
-        (expected["image"], expected["alpha"]), (grad_image.double(), grad_alpha.double())
-    )
+    differentiate(render(gaussians, camera), expected)
     for name in FIELDS:
         mine, theirs = getattr(gaussians, name).grad[1:], leaves[name].grad[1:]
         assert theirs.abs().max() > 0

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from lexsplat.captures import Capture, InitialPoints
 
 _TOLD_FROM = 500
-"""Iterations from which the time is told; the calibration takes as long as about thirty of them."""
+"""Fewest iterations with a forecast; the calibration takes as long as about thirty of them."""
 _FIRST = 2
 """Steps that are not timed."""
 _STEPS = 4

@@ -18,7 +18,7 @@ logging.addLevelName(NOTE, "note")
 log = logging.getLogger("lexsplat")
 
 _TOLD_FROM = 2.0
-"""Seconds from which the time of a stage is told."""
+"""Shortest stage with a forecast, in seconds."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class FirstUnits:
         self._start, self._told = 0.0, False
 
     def __call__(self, done: int, total: int) -> None:
-        """Receive the number of finished units, first 0; nothing is told from the middle on."""
+        """Receive the number of finished units, first 0; from the middle on, a forecast is of no use."""
         if not done:
             self._start, self._told = time.monotonic(), False
         seconds = time.monotonic() - self._start

@@ -44,7 +44,7 @@ from lexsplat.runtime.progress import Event, Listener, silent, tell
 from lexsplat.runtime.sampling import evenly
 
 _TOLD_FROM = 12
-"""Fewest views for which the time is told: the calibration takes as long as about four of them."""
+"""Fewest views with a forecast: the calibration takes as long as about four of them."""
 _VIEWS = 3
 """Views that are timed."""
 _SAMPLE = 4096

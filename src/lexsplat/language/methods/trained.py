@@ -29,7 +29,7 @@ REPORT_EVERY = 25
 """Steps between two events. The loss is checked as often."""
 
 _TOLD_FROM = 200
-"""Iterations from which the time is told."""
+"""Fewest iterations with a forecast."""
 _FIRST, _STEPS = 2, 6
 """Steps of the calibration that are not timed, and that are."""
 
