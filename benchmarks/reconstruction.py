@@ -36,6 +36,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "mcmc": {"strategy": "mcmc"},
     "plain-rates": {"rate_scale": 1.0},
+    "rates-without-cool-down": {"rate_scale": 15 ** (1 / 3)},
     "no-warm-up": {"warm_up": 0.0},
     "no-cool-down": {"cool_down": 0.0},
     "no-renewal": {"renewal": 0.0},
@@ -54,7 +55,7 @@ def main() -> None:
     parser.add_argument("captures", nargs="+", metavar="CAPTURE[=DOWNSCALE]")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["default", "mcmc"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--iterations", type=int, help="optimization steps; default: 2,250, on CUDA 30,000")
+    parser.add_argument("--iterations", type=int, help="optimization steps; default: 2,000, on CUDA 30,000")
     parser.add_argument("--on", choices=("validation", "test"), default="validation")
     parser.add_argument("--photos", type=int, help="training photos, evenly spaced; default: all")
     parser.add_argument("--device", default="cpu")

@@ -370,4 +370,4 @@ def test_build_takes_the_words_of_bundled_captures(word, folder, tmp_path, monke
     assert cli.main(["build", word, "--output", "scene"]) == 130
     capture, output, settings = received
     assert (capture.name, output) == (folder, Path("scene"))
-    assert (settings.clip, settings.codebook.num_codes) == ("bundled", 256)
+    assert (settings.clip, settings.dino) == ("bundled", "bundled")

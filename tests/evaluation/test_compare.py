@@ -177,14 +177,12 @@ def test_baselines_receive_a_quarter_of_the_memory(compared, tiny_capture, tmp_p
 
 
 def test_bundled_captures_have_names_and_the_settings_of_the_demo(tmp_path, monkeypatch):
-    from lexsplat.evaluation.demo import DEMO_CONFIG
     from lexsplat.pipeline.config import BuildConfig
 
     monkeypatch.chdir(tmp_path)
     folder, settings = capture_and_settings("second", BuildConfig())
     assert (folder / "segmentations").is_dir()
     assert (settings.clip, settings.dino) == ("bundled", "bundled")
-    assert settings.codebook == DEMO_CONFIG.codebook
     folder, settings = capture_and_settings("demo", BuildConfig(clip="some/clip"))
     assert folder.name == "tabletop"
     assert settings.clip == "some/clip"

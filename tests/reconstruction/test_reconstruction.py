@@ -234,11 +234,27 @@ def test_the_full_length_uses_the_rates_and_schedule_of_3dgs():
 
 def test_short_trainings_use_higher_rates_and_start_at_low_resolution():
     config = ReconstructionConfig(iterations=3_750)
-    assert config.rates(1.0)["means"] == pytest.approx(2 * 1.6e-4)
+    assert config.rates(1.0)["means"] == pytest.approx(3.2 * 1.6e-4)
     assert config.rates(1.0)["opacity_logits"] == 5e-2
     assert config.warm_up_iterations == 1_125
     assert config.renewed_share == 0.15
     assert not config.is_long
+
+
+@pytest.mark.parametrize(
+    ("changes", "scale"),
+    [
+        ({}, 3.2),
+        ({"cool_down": 0.0}, 2),
+        ({"strategy": "mcmc"}, 2),
+        ({"iterations": 100}, 4.8),
+        ({"iterations": 100, "cool_down": 0.0}, 3),
+        ({"iterations": 30_000, "cool_down": 0.25}, 1.6),
+    ],
+)
+def test_rates_are_higher_where_a_cool_down_settles_them(changes, scale):
+    config = ReconstructionConfig(**{"iterations": 3_750, **changes})
+    assert config.scale_of_rates == pytest.approx(scale)
 
 
 @pytest.mark.parametrize(("renewal", "left"), [(None, 0), (0.15, 0), (0.0, 20)])

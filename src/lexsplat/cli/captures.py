@@ -17,7 +17,7 @@ def capture_and_settings(capture: str, settings: BuildConfig) -> tuple[Path, Bui
     """The folder of a capture, and the settings to build it with.
 
     A word of `BUNDLED` stands for the bundled capture unless a folder has that name. Settings of a bundled capture
-    that are left at their defaults become those of the demo: the bundled encoders and their codebook.
+    that are left at their defaults become those of the demo: the bundled encoders.
     """
     path = Path(capture)
     if capture not in BUNDLED or path.exists():
@@ -27,7 +27,7 @@ def capture_and_settings(capture: str, settings: BuildConfig) -> tuple[Path, Bui
     from lexsplat.evaluation.demo import DEMO_CONFIG, demo_capture
 
     changes: dict[str, Any] = {}
-    for name in ("clip", "dino", "codebook"):
+    for name in ("clip", "dino"):
         if getattr(settings, name) == getattr(BuildConfig(), name):
             changes[name] = getattr(DEMO_CONFIG, name)
     return demo_capture(BUNDLED[capture]), dataclasses.replace(settings, **changes)

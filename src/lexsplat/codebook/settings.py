@@ -8,13 +8,17 @@ from typing import Literal
 MAX_CODES = 256
 """Most codes of a codebook: an index map has one byte a pixel."""
 
+PAPER_CODES = 128
+"""Codes of the paper, but for two of its scenes."""
+
 
 @dataclass(frozen=True)
 class CodebookConfig:
     """Settings of the quantization.
 
     Args:
-        num_codes: Size K of the discrete feature space, 1 to 256. The paper uses 128 (bonsai 64, kitchen 32).
+        num_codes: Size K of the discrete feature space, 1 to 256; `as_in_paper` takes 128. With 256, no index is left
+            for a pixel without a meaning.
         lambda_dino: Weight of the DINO cosine in Eq. 4 and 5.
         lambda_cos: Weight of the cosine loss in Eq. 7.
         lambda_lb: Weight of the load-balancing loss in Eq. 7 (1 in the authors' code).
@@ -30,7 +34,7 @@ class CodebookConfig:
         sample_size: Most feature vectors in the sample, equally many from each training view.
     """
 
-    num_codes: int = 128
+    num_codes: int = 255
     lambda_dino: float = 0.5
     lambda_cos: float = 1.0
     lambda_lb: float = 0.5
@@ -61,7 +65,17 @@ class CodebookConfig:
             )
 
     def as_in_paper(self) -> CodebookConfig:
-        """The paper's fit with the same loss weights: gradient steps on Eq. 7 from a random start."""
+        """The paper's fit with the same loss weights: gradient steps on Eq. 7 from a random start.
+
+        The number of codes becomes the paper's unless it was changed.
+        """
+        codes = PAPER_CODES if self.num_codes == CodebookConfig.num_codes else self.num_codes
         return replace(
-            self, init="uniform", steps=2000, learning_rate=1e-4, weight_decay=0.01, batch_size=16_384
+            self,
+            num_codes=codes,
+            init="uniform",
+            steps=2000,
+            learning_rate=1e-4,
+            weight_decay=0.01,
+            batch_size=16_384,
         )

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from lexsplat.codebook import CodebookConfig
 from lexsplat.evaluation.scenes import evaluate_scene
 from lexsplat.language.methods import MethodName
 from lexsplat.pipeline.build import build
@@ -19,7 +18,7 @@ CaptureName = Literal["tabletop", "second"]
 CAPTURES = Path(__file__).resolve().parents[1] / "demo" / "captures"
 """Folder of the captures: ``images/``, ``sparse/0/``, ``segmentations/``, ``test_views.json``."""
 
-DEMO_CONFIG = BuildConfig(clip="bundled", dino="bundled", codebook=CodebookConfig(num_codes=256))
+DEMO_CONFIG = BuildConfig(clip="bundled", dino="bundled")
 """Settings of the demo; docs/results.md states on which views each setting was chosen."""
 
 

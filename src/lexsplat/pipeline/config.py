@@ -29,7 +29,7 @@ CPU_PIXELS = 80_000
 """Pixels of the working images on a CPU if no downscale is given: about 320x240."""
 CUDA_PIXELS = 2_000_000
 """Pixels of the working images on CUDA if no downscale is given: 1600 wide at 4:3, as in 3DGS."""
-CPU_ITERATIONS = 2_250
+CPU_ITERATIONS = 2_000
 """Reconstruction steps on a CPU if none are given."""
 BLOCKS_ITERATIONS = 3_000
 """The same for a reconstruction in blocks, which replaces no Gaussians: fewer steps were not measured there."""
@@ -62,7 +62,7 @@ class BuildConfig:
         checkpoint_seconds: Seconds between two checkpoints of a training.
         downscale: Factor by which photos are reduced for reconstruction and language; by default what suits the
             device.
-        iterations: Reconstruction steps; by default 30,000 on CUDA and 2,250 on a CPU (3,000 with ``blocks``).
+        iterations: Reconstruction steps; by default 30,000 on CUDA and 2,000 on a CPU (3,000 with ``blocks``).
         frames: Number of frames sampled from a video.
         test_every: Every n-th view is held out if the capture does not list held-out views; 0 holds out none.
         up: Up direction in the axes of the cameras, as "x,y,z"; by default estimated from the cameras, or

@@ -140,9 +140,7 @@ class VisitReconstructor(Reconstructor):
     ) -> None:
         self._visit, self._state, self._order_of_views = visit, state, visit.views(seed)
         # Gaussians are added and removed between the visits.
-        config = replace(
-            config, densify_every=_NEVER, densify_min_every=_NEVER, reset_opacities=False, cool_down=0.0
-        )
+        config = replace(config, densify_every=_NEVER, densify_min_every=_NEVER, reset_opacities=False)
         own = _seed(seed, visit.number)
         super().__init__(capture, config, None, seed=own, **options)  # type: ignore[arg-type]
         self._photo_folder = photos
@@ -249,6 +247,7 @@ def reconstruct_blocks(
         TrainingError: If a block diverges; finished visits are kept.
         WorkersError: If a worker comes later that does not see ``run.folder``, as the others do.
     """
+    config = replace(config, cool_down=0.0)  # `CALM` takes its place
     cap = config.cap(torch.device(run.device))
     deal = run.device != "cpu" or 2 * cap * budget.GAUSSIAN_BYTES <= run.memory
     blocks = cut_blocks(capture, points.points, ground_axes(up), count, deal=deal)
