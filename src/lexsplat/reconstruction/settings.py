@@ -77,8 +77,8 @@ class ReconstructionConfig:
             else 0.
         exposure: Fit an affine color change per training photo, for captures whose exposure varies.
         rate_scale: Factor of all learning rates but that of the opacities; None is the cube root of
-            30,000 / iterations, between 1 and 3, so that a short training takes larger steps, and 1.6 times that where
-            "default" has a cool-down to settle them.
+            30,000 / iterations, between 1 and 3, so that a short training takes larger steps, and 1.6 times that
+            where "default" has a cool-down to settle them.
         means_rate: Learning rate of the centers at the start, relative to the extent of the scene.
         means_rate_final: The same at the end; it decays exponentially.
         scales_rate: Learning rate of the logarithms of the scales.
