@@ -9,11 +9,12 @@ For each size, number of Gaussians and number of channels, in milliseconds (best
     blend       the blending part of forward
     naive       the same blending pixel by pixel over the list of its tile, with libm's exp (`per_pixel`)
 
-and the pairs of Gaussian and tile per second of forward time. Two lower bounds, in milliseconds:
+and the pairs of Gaussian and tile per second of forward time. Three lower bounds, in milliseconds:
 
     exps        time of the exponentials of blending: the rows of 16 pixels that Gaussians reach, at the measured
-                rate of a loop of only `alpha_of`
+                rate of a loop of only `alpha_of`; forward and backward each evaluate them once
     bytes       time to move the necessary bytes of forward (`bytes_moved`) at the rate of a copy
+    b.bytes     the same of backward (`bytes_of_gradients`)
 """
 
 from __future__ import annotations
@@ -129,6 +130,19 @@ def bytes_moved(gaussians: Gaussians, channels: int, pairs: TilePairs) -> int:
     return 4 * (parameters + projected + 2 * len(pairs.members) + pixels)
 
 
+def bytes_of_gradients(gaussians: Gaussians, channels: int, pairs: TilePairs) -> int:
+    """Minimum number of bytes that a backward pass reads and writes.
+
+    It reads what forward wrote and the gradients of the image, writes and reads the gradients of the projected
+    numbers, and reads the parameters and writes their gradients.
+    """
+    parameters = sum(tensor.numel() for tensor in gaussians.tensors().values())
+    parameters += len(gaussians) * (channels - 3)
+    projected = 3 * len(pairs.order) * (12 + channels)
+    pixels = 2 * pairs.width * pairs.height * (channels + 1)
+    return 4 * (2 * parameters + projected + len(pairs.members) + pixels)
+
+
 def copy_rate(repeats: int) -> float:
     """Bytes read and written per millisecond by a copy of 64 MiB on all threads."""
     source = torch.ones(1 << 24)
@@ -169,12 +183,14 @@ def run_case(width: int, height: int, count: int, channels: int, repeats: int) -
     if np.abs(ours.numpy() - image).mean() > 1e-5:
         raise SystemExit("the naive port renders another image")
     floor = measure(lambda: parallel(only_alphas, 64, 4, rows_of(pairs), np.empty(64, np.float32)), repeats)
+    rate = copy_rate(repeats)
     return {
         "width": width, "height": height, "gaussians": count, "channels": channels, "pairs": len(pairs.members),
         "forward_ms": forward[0], "forward_median_ms": forward[1],
         "backward_ms": backward_times[0], "backward_median_ms": backward_times[1],
         "blend_ms": blend[0], "naive_ms": naive[0], "ratio": naive[0] / blend[0], "floor_ms": floor[0],
-        "bytes_ms": bytes_moved(gaussians, channels, pairs) / copy_rate(repeats),
+        "bytes_ms": bytes_moved(gaussians, channels, pairs) / rate,
+        "backward_bytes_ms": bytes_of_gradients(gaussians, channels, pairs) / rate,
         "pairs_per_second": len(pairs.members) / forward[0] * 1e3,
     }  # fmt: skip
 
@@ -190,7 +206,7 @@ def main() -> None:
     )
     print(
         f"{'size':>8} {'N':>7} {'C':>3} {'pairs':>8}   {'forward':>14}   {'backward':>14} {'Mpairs/s':>9}"
-        f" {'blend':>7} {'naive':>7} {'ratio':>6} {'exps':>6} {'bytes':>6}"
+        f" {'blend':>7} {'naive':>7} {'ratio':>6} {'exps':>6} {'bytes':>6} {'b.bytes':>7}"
     )
     cases = []
     for width, height in SIZES:
@@ -203,7 +219,7 @@ def main() -> None:
                 print(
                     f"{width:>4}x{height} {count:>7} {channels:>3} {c['pairs']:>8}   {forward:>14}   {backward:>14}"
                     f" {c['pairs_per_second'] / 1e6:>9.1f} {c['blend_ms']:>7.1f} {c['naive_ms']:>7.1f}"
-                    f" {c['ratio']:>6.1f} {c['floor_ms']:>6.1f} {c['bytes_ms']:>6.1f}",
+                    f" {c['ratio']:>6.1f} {c['floor_ms']:>6.1f} {c['bytes_ms']:>6.1f} {c['backward_bytes_ms']:>7.1f}",
                     flush=True,
                 )
     write_record(options.json, cases, threads=options.threads)

@@ -5,19 +5,23 @@ Encoders are built from a local folder, so their code is the same with and witho
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import logging
 import os
+import re
 import shutil
-from collections.abc import Collection, Iterator
+import time
+from collections.abc import Collection, Iterable, Iterator
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from lexsplat.features.weights import INDEX, WEIGHTS, first_weights, weight_files
+from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.errors import FileFormatError, ModelError
-from lexsplat.runtime.files import read_json
+from lexsplat.runtime.files import atomic_path, read_json
 from lexsplat.runtime.progress import NOTE
 
 log = logging.getLogger("lexsplat")
@@ -41,6 +45,11 @@ _TOKENIZER_SETTINGS = ("tokenizer_config.json", "special_tokens_map.json", "adde
 _OTHERS = {"segments": "superpixels, which need no model (`--features.segments slic`)"}
 """What is there in place of a model that has no bundled one."""
 _HUB_TIMEOUT = 5.0  # seconds to wait for the hub's first response; without a network it fails at once
+
+KEPT_FROM = 1 << 26
+"""Bytes of a model from which its hash is kept; below, it takes a tenth of a second."""
+_FRESH = 2.0
+"""Seconds after a change in which another one might leave the time of the file as it is."""
 
 
 def present_name(name: str) -> str:
@@ -167,14 +176,40 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def content_hash(folder: Path, tower: str) -> str:
-    """Hash of the files on which a model's output depends (`loaded_files`). 32 hex digits."""
+    """Hash of the files on which a model's output depends (`loaded_files`). 32 hex digits.
+
+    Hashes of large models are kept in the user's cache, under the place, size and time of change of their files.
+    """
+    files = loaded_files(folder, tower)
+    kept = _kept_hash(files)
+    with contextlib.suppress(OSError, UnicodeDecodeError):
+        if kept is not None and re.fullmatch("[0-9a-f]{32}", known := kept.read_text()):
+            return known
     digest = hashlib.blake2b(digest_size=16)
-    for path in loaded_files(folder, tower):
+    for path in files:
         digest.update(path.name.encode())
         with path.open("rb") as stream:
             while block := stream.read(1 << 20):
                 digest.update(block)
-    return digest.hexdigest()
+    found = digest.hexdigest()
+    if kept is not None and kept == _kept_hash(files):  # no file has changed meanwhile
+        with contextlib.suppress(OSError), atomic_path(kept) as temporary:
+            temporary.write_text(found)
+    return found
+
+
+def _kept_hash(files: Iterable[Path]) -> Path | None:
+    """Where the hash of these files is kept; None for small models, fresh files, and users without a home."""
+    facts = {path.resolve(): path.stat() for path in files}
+    newest = max(stat.st_mtime for stat in facts.values())
+    if sum(stat.st_size for stat in facts.values()) < KEPT_FROM or time.time() - newest < _FRESH:
+        return None
+    rows = sorted(
+        (str(path), stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for path, stat in facts.items()
+    )
+    with contextlib.suppress(RuntimeError):
+        return user_cache() / "hashes" / hashlib.blake2b(repr(rows).encode(), digest_size=16).hexdigest()
+    return None
 
 
 def _check_readable(path: Path, mode: int = os.R_OK) -> None:

@@ -1,0 +1,86 @@
+"""Hashes of large models are kept: a question need not read a gigabyte to know its encoder."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+
+import pytest
+
+from lexsplat.features import hub
+from lexsplat.runtime.environment import user_cache
+
+
+@pytest.fixture
+def model(clip_folder, tmp_path, monkeypatch):
+    """A copy of the tiny CLIP, a minute old, whose hash is worth keeping; the cache is this test's own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(hub, "KEPT_FROM", 1)
+    folder = shutil.copytree(clip_folder, tmp_path / "copy")
+    age(folder, 60)
+    return folder
+
+
+def age(folder, seconds: float) -> None:
+    for path in folder.iterdir():
+        os.utime(path, (time.time() - seconds,) * 2)
+
+
+def kept() -> list:
+    folder = user_cache() / "hashes"
+    return list(folder.iterdir()) if folder.exists() else []
+
+
+def test_a_kept_hash_is_the_hash_and_the_weights_are_not_read_again(model, clip_folder, monkeypatch):
+    first = hub.content_hash(model, "clip")
+    monkeypatch.setattr(hub, "KEPT_FROM", 1 << 60)
+    assert first == hub.content_hash(clip_folder, "clip")
+    monkeypatch.setattr(hub, "KEPT_FROM", 1)
+    assert len(kept()) == 1
+    monkeypatch.setattr(hub.hashlib, "blake2b", short_inputs_only(hub.hashlib.blake2b))
+    assert hub.content_hash(model, "clip") == first
+
+
+def short_inputs_only(real):
+    """Stands for blake2b, but takes names and no contents."""
+
+    def made(*arguments, **options):
+        assert arguments, "the files are read again"
+        return real(*arguments, **options)
+
+    return made
+
+
+def test_a_changed_file_has_a_hash_of_its_own_even_where_its_size_stays(model):
+    first = hub.content_hash(model, "clip")
+    weights = bytearray((model / "model.safetensors").read_bytes())
+    weights[-1] ^= 1
+    (model / "model.safetensors").write_bytes(weights)
+    age(model, 60)  # as a program that sets back the time of a file
+    assert hub.content_hash(model, "clip") != first
+
+
+def test_hashes_of_fresh_files_and_of_small_models_are_not_kept(model, monkeypatch):
+    age(model, 0)
+    hub.content_hash(model, "clip")
+    assert not kept()
+    age(model, 60)
+    monkeypatch.setattr(hub, "KEPT_FROM", 1 << 26)
+    hub.content_hash(model, "clip")
+    assert not kept()
+
+
+@pytest.mark.parametrize("damage", [b"", b"\xff\xfe", b"0" * 31, b"../" * 10])
+def test_a_damaged_kept_hash_is_computed_again(model, damage):
+    first = hub.content_hash(model, "clip")
+    (path,) = kept()
+    path.write_bytes(damage)
+    assert hub.content_hash(model, "clip") == first
+    assert path.read_text() == first
+
+
+def test_a_cache_that_cannot_be_written_does_no_harm(model, tmp_path):
+    (tmp_path / "cache").write_text("a file where the folder should be")
+    first = hub.content_hash(model, "clip")
+    assert hub.content_hash(model, "clip") == first
