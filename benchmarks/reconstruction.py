@@ -36,9 +36,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "mcmc": {"strategy": "mcmc"},
     "plain-rates": {"rate_scale": 1.0},
-    "rates-without-cool-down": {"rate_scale": 15 ** (1 / 3)},
     "no-warm-up": {"warm_up": 0.0},
-    "no-cool-down": {"cool_down": 0.0},
+    "no-cool-down": {"cool_down": 0.0},  # with the lower rates of a training without one
     "no-renewal": {"renewal": 0.0},
     "classic": {"antialiased": False},
     "half-cap": {"max_gaussians": 20_000},

@@ -3,8 +3,8 @@
     python benchmarks/text_tower.py [--repeats 9] [--json FILE]
 
 Each process loads a model folder and embeds `PHRASES`: "ours" by `lexsplat.features.clip_text`, "transformers" by
-CLIPTextModelWithProjection, "ONNX Runtime" by a model exported beforehand (needs the packages onnx and
-onnxscript; without torch in the process, and again with it, as scores of Gaussians need it). All take the same
+CLIPTextModelWithProjection, "ONNX Runtime" by a model exported beforehand (needs the packages onnx, onnxscript
+and onnxruntime; without torch in the process, and again with it, as scores of Gaussians need it). All take the same
 tokenizer from the package tokenizers. Wall and processor seconds from the start of the process, peak memory, and
 the largest difference of a number from transformers' embeddings. The ways alternate; medians over the repeats,
 after one round that fills the caches. Models: the bundled CLIP, and a CLIP of the size of ViT-B/16 with random
@@ -159,6 +159,8 @@ def export(folder: Path) -> None:
 
     given = tuple(map(torch.from_numpy, token_rows(folder)))
     try:
+        import onnxruntime  # noqa: F401
+
         torch.onnx.export(
             Tower(), given, folder / "text.onnx", dynamo=True, input_names=["tokens", "mask"], verbose=False
         )

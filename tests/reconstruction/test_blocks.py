@@ -77,7 +77,7 @@ def test_gaussians_that_reach_into_an_image_have_a_size_in_it(capture):
 
 def test_a_visit_with_all_views_takes_the_steps_of_one_piece(capture, points, monkeypatch):
     monkeypatch.setattr(block_training, "BETAS", (0.9, 0.999))  # those of one piece
-    whole = Reconstructor(capture, dataclasses.replace(CONFIG, warm_up=0.0), points)
+    whole = Reconstructor(capture, dataclasses.replace(CONFIG, warm_up=0.0, cool_down=0.0), points)
     cut = cut_blocks(capture, points.points, ground_axes(UP), 1, deal=False)
     (visit,) = (visit for group in plan(cut, CONFIG.iterations, 1) for visit in group)
     config, start = whole.config, CellState.untrained(whole.gaussians().map(torch.clone))
@@ -89,6 +89,22 @@ def test_a_visit_with_all_views_takes_the_steps_of_one_piece(capture, points, mo
         trainer.step()
     for name, tensor in whole.gaussians().tensors().items():
         assert torch.equal(tensor, trainer.gaussians().tensors()[name])
+
+
+def test_blocks_keep_the_rates_of_a_training_without_a_cool_down(capture, points, tmp_path, monkeypatch):
+    class Begun(Exception):
+        pass
+
+    def stop(files, blocks, config, *rest):
+        assert config.scale_of_rates == pytest.approx(
+            dataclasses.replace(CONFIG, cool_down=0.0).scale_of_rates
+        )
+        assert config.scale_of_rates < CONFIG.scale_of_rates
+        raise Begun
+
+    monkeypatch.setattr(block_training, "_write_start", stop)
+    with pytest.raises(Begun):
+        reconstruct_blocks(capture, CONFIG, points, UP, 2, BlockRun("cpu", 0, 1 << 30, tmp_path, "key"))
 
 
 def test_gaussians_of_other_cells_are_drawn_and_stay_as_they_are(capture, points, monkeypatch):

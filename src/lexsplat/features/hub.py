@@ -200,13 +200,14 @@ def content_hash(folder: Path, tower: str) -> str:
 
 def _kept_hash(files: Iterable[Path]) -> Path | None:
     """Where the hash of these files is kept; None for small models, fresh files, and users without a home."""
-    facts = {path.resolve(): path.stat() for path in files}
-    newest = max(stat.st_mtime for stat in facts.values())
-    if sum(stat.st_size for stat in facts.values()) < KEPT_FROM or time.time() - newest < _FRESH:
+    facts = [(path, path.stat()) for path in files]
+    newest = max(stat.st_mtime for _, stat in facts)
+    if sum(stat.st_size for _, stat in facts) < KEPT_FROM or time.time() - newest < _FRESH:
         return None
-    rows = sorted(
-        (str(path), stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for path, stat in facts.items()
-    )
+    rows = [
+        (path.name, str(path.resolve()), stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
+        for path, stat in facts
+    ]
     with contextlib.suppress(RuntimeError):
         return user_cache() / "hashes" / hashlib.blake2b(repr(rows).encode(), digest_size=16).hexdigest()
     return None

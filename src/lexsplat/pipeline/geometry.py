@@ -64,7 +64,9 @@ class Geometry:
 
     def inputs(self, config: BuildConfig, device: str) -> list[Any]:
         """What its Gaussians depend on beside photos and cameras; the name of a stage stands for its inputs."""
-        return [config.reconstruction, config.seed, device]
+        fit = config.reconstruction
+        rates = [fit.scale_of_rates] if fit.cooled_share else []  # a default that no setting holds
+        return [fit, *rates, config.seed, device]
 
     def outputs(self, checkpoints: Path) -> list[Path]:
         """What it writes beside the Gaussians."""
@@ -92,7 +94,7 @@ class _InBlocks(Geometry):
     blocks: int
 
     def inputs(self, config: BuildConfig, device: str) -> list[Any]:
-        return [*super().inputs(config, device), f"{self.blocks} blocks", config.up]
+        return [config.reconstruction, config.seed, device, f"{self.blocks} blocks", config.up]
 
     def make(self, config: BuildConfig, run: GeometryRun) -> tuple[Gaussians, dict[str, Any]]:
         points, fit = run.initial_points(), run.fit

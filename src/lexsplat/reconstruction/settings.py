@@ -22,7 +22,7 @@ COOLEST = 0.05
 """Factor of all learning rates at the end of the cool-down."""
 
 COOLED_RATES = 1.6
-"""Factor of the learning rates of a training that has a cool-down, which permits larger steps before it."""
+"""Factor of the learning rates, but that of the opacities, of a "default" training that has a cool-down."""
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,7 @@ def tell(stage: str, seconds: float, amount: str) -> None:
     Args:
         stage: Name of the stage.
         seconds: The forecast.
-        amount: What it is for, such as "2,250 iterations".
+        amount: What it is for, such as "2,000 iterations".
     """
     if seconds >= _TOLD_FROM:
         log.log(NOTE, "%s: about %s for %s", stage, duration(seconds), amount)
