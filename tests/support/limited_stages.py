@@ -154,9 +154,10 @@ def run_limited(work: Callable[[Path, int], str], folder: Path, memory: int, bes
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
         try:
             Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-            before = status_bytes("VmRSS")
+            before, code = status_bytes("VmRSS"), status_bytes("RssFile")
             said = work(folder, memory)
-            resident = status_bytes("VmHWM") - before
+            # Pages of libraries that this process had not used yet are not taken by the stage.
+            resident = status_bytes("VmHWM") - before - max(0, status_bytes("RssFile") - code)
         except BaseException as error:
             said, resident = f"{type(error).__name__}: {error}", -1
         os.write(write, json.dumps({"said": said[:4000], "resident": resident, "memory": memory}).encode())
