@@ -181,7 +181,7 @@ def content_hash(folder: Path, tower: str) -> str:
     Hashes of large models are kept in the user's cache, under the place, size and time of change of their files.
     """
     files = loaded_files(folder, tower)
-    kept = _kept_hash(files)
+    kept = _path_of_hash(files)
     with contextlib.suppress(OSError, UnicodeDecodeError):
         if kept is not None and re.fullmatch("[0-9a-f]{32}", known := kept.read_text()):
             return known
@@ -192,13 +192,13 @@ def content_hash(folder: Path, tower: str) -> str:
             while block := stream.read(1 << 20):
                 digest.update(block)
     found = digest.hexdigest()
-    if kept is not None and kept == _kept_hash(files):  # no file has changed meanwhile
+    if kept is not None and kept == _path_of_hash(files):  # no file has changed meanwhile
         with contextlib.suppress(OSError), atomic_path(kept) as temporary:
             temporary.write_text(found)
     return found
 
 
-def _kept_hash(files: Iterable[Path]) -> Path | None:
+def _path_of_hash(files: Iterable[Path]) -> Path | None:
     """Where the hash of these files is kept; None for small models, fresh files, and users without a home."""
     facts = [(path, path.stat()) for path in files]
     newest = max(stat.st_mtime for _, stat in facts)

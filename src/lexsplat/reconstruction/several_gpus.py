@@ -80,9 +80,8 @@ class PartReconstructor(Reconstructor):
             # The weights of a part alone would not know what the other parts hide.
             renewal=config.renewal if self._ranks == 1 else 0.0,
         )
-        if (
-            self._ranks > 1 and config.rate_scale is None
-        ):  # the higher rates of short trainings are of one process
+        if self._ranks > 1 and config.rate_scale is None:
+            # The higher rates of a training with a cool-down were measured with one process.
             part = replace(part, rate_scale=replace(part, cool_down=0.0).scale_of_rates)
         super().__init__(capture, part, own, device=device, seed=seed + self._rank)
         self._generator = torch.Generator().manual_seed(seed)  # one order of views in all processes
