@@ -16,15 +16,24 @@ const DONE: Record<keyof typeof DOING, string> = {
 export type Edit = Change | "undo" | "redo";
 
 export class Edits {
-  busy = false;
+  // Of the whole page: the scene that an edit makes gets controls of its own, which wait until it is shown.
+  static #busy = false;
+  static #controls: HTMLElement[] = [];
 
   /** `controls` wait while an edit is done; `run` tells what fails. */
   constructor(
     readonly server: Server,
-    readonly controls: HTMLElement[],
+    controls: HTMLElement[],
     readonly note: (text: string) => void,
     readonly run: (work: () => Promise<void>) => void,
-  ) {}
+  ) {
+    Edits.#controls = controls;
+    this.#wait(Edits.#busy);
+  }
+
+  get busy(): boolean {
+    return Edits.#busy;
+  }
 
   do(action: Edit, values: object): void {
     if (this.busy) return;
@@ -43,7 +52,7 @@ export class Edits {
   }
 
   #wait(busy: boolean): void {
-    this.busy = busy;
-    for (const element of this.controls) element.inert = busy;
+    Edits.#busy = busy;
+    for (const element of Edits.#controls) element.inert = busy;
   }
 }
