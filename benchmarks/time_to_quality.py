@@ -5,6 +5,10 @@
 Both trainings run in slices that take turns, so that other work on the machine slows both. The time between
 two slices is interpolated. PSNR is measured outside the clock, on test views; ``--on validation`` takes every
 sixth training view instead, to choose settings by.
+
+Schedules are scaled to the length of a training, so a training that is cut off is worse than one that is planned to
+end there. ``--lengths .3 .4 .6 1`` therefore runs a whole training of each share of the usual steps, and interpolates
+between their ends: the seconds of the shortest training that reaches the PSNR.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -58,16 +62,6 @@ class Training:
         """Whether all steps have run."""
         return self.rows[-1]["steps"] >= self.total
 
-    def seconds_to(self, goal: float, clock: str) -> float | None:
-        """Seconds of a clock ("wall" or "processor") until the PSNR reaches ``goal`` and stays; None if never."""
-        above = [row["psnr"] >= goal for row in self.rows]
-        if not above[-1]:
-            return None
-        first = len(above) - above[::-1].index(False)
-        before, after = self.rows[first - 1], self.rows[first]
-        share = (goal - before["psnr"]) / (after["psnr"] - before["psnr"])
-        return before[clock] + share * (after[clock] - before[clock])
-
     def close(self) -> None:
         """End the process."""
         self.process.kill()
@@ -79,6 +73,17 @@ class Training:
         if not line:
             raise SystemExit(f"a training ended early with status {self.process.wait()}")
         return json.loads(line)
+
+
+def seconds_to(goal: float, rows: Sequence[Mapping[str, float]], clock: str) -> float | None:
+    """Seconds of a clock ("wall" or "processor") until the PSNR reaches ``goal`` and stays; None if never."""
+    above = [row["psnr"] >= goal for row in rows]
+    if not above[-1]:
+        return None
+    first = len(above) - above[::-1].index(False)
+    before, after = rows[first - 1], rows[first]
+    share = (goal - before["psnr"]) / (after["psnr"] - before["psnr"])
+    return before[clock] + share * (after[clock] - before[clock])
 
 
 def main() -> None:
@@ -93,6 +98,13 @@ def main() -> None:
     parser.add_argument("--on", choices=("validation", "test"), default="test")
     parser.add_argument("--goal", type=float, help="PSNR in dB; default: that of the capture")
     parser.add_argument("--slices", type=int, default=30)
+    parser.add_argument(
+        "--lengths",
+        type=float,
+        nargs="+",
+        metavar="SHARE",
+        help="whole trainings of these shares of the steps",
+    )
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     rows = []
@@ -123,29 +135,46 @@ def compared(capture: str, seed: int, base: Path, options: argparse.Namespace) -
     """Train both versions in turns; print and return one row."""
     name = Path(capture.partition("=")[0]).name
     goal = options.goal or GOALS[name]
+    if options.lengths:
+        ends = [trained(capture, seed, base, options, share) for share in sorted(options.lengths)]
+        start = {"steps": 0, "wall": 0.0, "processor": 0.0, "psnr": 0.0}
+        curves = {version: [start, *(end[version][-1] for end in ends)] for version in ("base", "ours")}
+    else:
+        curves = trained(capture, seed, base, options, 1.0)
+    row: dict[str, Any] = {"capture": name, "seed": seed, "goal": goal}
+    for version, curve in curves.items():
+        row[version] = {
+            "psnr": curve[-1]["psnr"],
+            "gaussians": curve[-1]["gaussians"],
+            **{clock: curve[-1][clock] for clock in ("wall", "processor")},
+            **{f"{clock}_to_goal": seconds_to(goal, curve, clock) for clock in ("wall", "processor")},
+            "curve": curve,
+        }
+    print_row(row)
+    return row
+
+
+def trained(
+    capture: str, seed: int, base: Path, options: argparse.Namespace, share: float
+) -> dict[str, list[dict[str, float]]]:
+    """The curves of both versions, trained in turns for a share of their usual steps."""
     arguments = [capture, "--seed", str(seed), "--on", options.on, "--threads", str(options.threads)]
     with ExitStack() as stack:
-        pair = {
-            "base": Training(base, options.base_settings, arguments),
-            "ours": Training(REPOSITORY / "src", options.settings, arguments),
-        }
-        for training in pair.values():
+
+        def started(source: Path, settings: Mapping[str, Any]) -> Training:
+            training = Training(source, settings, [*arguments, "--length", str(share)])
             stack.callback(training.close)
+            return training
+
+        pair = {
+            "base": started(base, options.base_settings),
+            "ours": started(REPOSITORY / "src", options.settings),
+        }
         while not all(training.done for training in pair.values()):
             for training in pair.values():
                 if not training.done:
                     training.run(-(-training.total // options.slices))
-    row: dict[str, Any] = {"capture": name, "seed": seed, "goal": goal}
-    for version, training in pair.items():
-        row[version] = {
-            "psnr": training.rows[-1]["psnr"],
-            "gaussians": training.rows[-1]["gaussians"],
-            **{clock: training.rows[-1][clock] for clock in ("wall", "processor")},
-            **{f"{clock}_to_goal": training.seconds_to(goal, clock) for clock in ("wall", "processor")},
-            "curve": training.rows,
-        }
-    print_row(row)
-    return row
+        return {version: training.rows for version, training in pair.items()}
 
 
 def print_row(row: Mapping[str, Any]) -> None:

@@ -39,6 +39,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--on", choices=("validation", "test"), default="test")
     parser.add_argument("--settings", type=json.loads, default={}, help="changed fields, as JSON")
+    parser.add_argument("--length", type=float, default=1.0, help="share of the usual steps")
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -77,7 +78,9 @@ def prepared(options: argparse.Namespace) -> tuple[Any, Any]:
         held_out = capture.train_names[::VALIDATION_EVERY]
         kept = tuple(view for view in capture.train_names if view not in held_out)
         capture = dataclasses.replace(capture, train_names=kept, test_names=held_out)
-    return capture, dataclasses.replace(config.reconstruction, **options.settings)
+    training = dataclasses.replace(config.reconstruction, **options.settings)
+    iterations = max(1, round(options.length * training.iterations))
+    return capture, dataclasses.replace(training, iterations=iterations)
 
 
 @torch.no_grad()
