@@ -12,9 +12,12 @@ import subprocess
 import sys
 import tempfile
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import MappingProxyType
+
+NONE: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -43,19 +46,27 @@ class Ended:
     err: str
 
 
-def run_warm(libraries: Sequence[str], *groups: Sequence[Program]) -> list[Ended]:
+def run_warm(
+    libraries: Sequence[str], *groups: Sequence[Program], environment: Mapping[str, str] = NONE
+) -> list[Ended]:
     """Run programs that find some libraries imported.
 
     Args:
         libraries: Modules to import before the forks; an import must start no thread.
         *groups: Programs that run at the same time; the groups run one after the other.
+        environment: Variables that are set before the imports.
 
     Returns:
         The ends of all programs, in the order given.
     """
     task = {"libraries": list(libraries), "groups": [[asdict(one) for one in group] for group in groups]}
     done = subprocess.run(
-        [sys.executable, __file__], input=json.dumps(task), capture_output=True, text=True, timeout=900
+        [sys.executable, __file__],
+        input=json.dumps(task),
+        capture_output=True,
+        text=True,
+        timeout=900,
+        env={**os.environ, **environment},
     )
     assert done.returncode == 0, done.stderr[-2000:]
     return [Ended(**one) for one in json.loads(done.stdout)]
