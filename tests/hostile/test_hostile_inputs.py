@@ -67,8 +67,9 @@ def corpus(tmp_path_factory):
             reports.update(json.loads(output.read_text()))
         if process.returncode:
             current = output.with_suffix(".current")
-            tried = current.read_text() if current.exists() else "the start"
+            tried = current.read_text().strip() if current.exists() else ""
             last = output.with_suffix(".log").read_text(errors="replace")[-2000:]
+            tried = tried or "the start"
             reports[tried.split()[0]] = {"crash": f"ended with {process.returncode} at {tried}: {last}"}
     return reports
 
