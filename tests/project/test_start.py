@@ -5,7 +5,7 @@ import json
 from collections.abc import Callable
 
 import pytest
-from support.warm_starts import Ended, Program, run_warm
+from support.warm_starts import Ended, Program, Stage, run_warm
 
 from lexsplat.cli import COMMANDS
 from lexsplat.scenes.library import Library
@@ -50,8 +50,16 @@ ALLOWED = {
 }
 """Libraries that a command may load."""
 
-WARM = (("torch", "numpy", "tyro", "rich"), ("tyro", "rich"), ())
-"""Libraries that a command may find imported, if it may load all of them: then their imports prove nothing."""
+WARMER = (
+    (), ("tyro", "rich"), ("torch", "numpy"), ("PIL.Image",), ("scipy.ndimage", "scipy.sparse", "scipy.spatial"),
+    ("safetensors.torch",), ("numba",),
+)  # fmt: skip
+"""Libraries in the order in which the process imports them whose forks the programs are.
+
+A program may find imported what it may load: then its own imports of that prove nothing.
+"""
+QUICK = 2
+"""Stages that import nothing large."""
 
 REPORT = """
 import json, sys
@@ -75,31 +83,34 @@ EXPECTED: dict[tuple[str, ...], tuple[str, set[str]]] = {
 """Programs, their code, and the libraries that they may load."""
 
 
-def warm_of(words: tuple[str, ...]) -> tuple[str, ...]:
-    """The libraries that a program finds imported."""
-    return next(warm for warm in WARM if set(warm) <= EXPECTED[words][1])
+def stage_of(words: tuple[str, ...]) -> int:
+    """The last stage before which only libraries are imported that a program may load."""
+    allowed = EXPECTED[words][1]
+    fits = [{name.partition(".")[0] for name in names} <= allowed for names in WARMER]
+    return (*fits, False).index(False) - 1
 
 
 @pytest.fixture(scope="module")
 def surplus(tmp_path_factory) -> Callable[..., set[str]]:
     """The libraries that a program loads beyond what it may.
 
-    Programs that find the same libraries imported run together. They share a working directory with a library of the
-    bundled scene, "rooms".
+    Programs share a working directory with a library of the bundled scene, "rooms".
     """
     place = tmp_path_factory.mktemp("place")
     Library.create(place / "rooms", device="cpu").add("demo")
 
     @functools.cache
-    def ended(warm: tuple[str, ...]) -> dict[tuple[str, ...], Ended]:
-        together = [words for words in EXPECTED if warm_of(words) == warm]
-        programs = [
-            Program(EXPECTED[words][0] + REPORT, words, str(place), {"COLUMNS": "80"}) for words in together
-        ]
-        return dict(zip(together, run_warm(warm, *([one] for one in programs))))
+    def ended(quick: bool) -> dict[tuple[str, ...], Ended]:
+        names, stages = [], []
+        for number in range(QUICK) if quick else range(len(WARMER)):
+            here = [words for words in EXPECTED if stage_of(words) == number and (number < QUICK) is quick]
+            programs = [Program(EXPECTED[w][0] + REPORT, w, str(place), {"COLUMNS": "80"}) for w in here]
+            names += here
+            stages.append(Stage(WARMER[number], [[program] for program in programs]))
+        return dict(zip(names, run_warm(*stages), strict=True))
 
     def of(*words: str) -> set[str]:
-        done = ended(warm_of(words))[words]
+        done = ended(stage_of(words) < QUICK)[words]
         assert done.status == 0, done.err
         return set(json.loads(done.err.splitlines()[-1])) & LIBRARIES - EXPECTED[words][1]
 

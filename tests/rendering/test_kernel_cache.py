@@ -7,7 +7,7 @@ import numba
 import numpy as np
 import pytest
 from numba.core.caching import NullCache
-from support.warm_starts import Ended, Program, run_warm
+from support.warm_starts import Ended, Program, Stage, run_warm
 
 pytestmark = pytest.mark.slow
 
@@ -40,7 +40,7 @@ def runs(kernels) -> dict[str, Ended]:
         ("left", "right"): shared, ("after both",): shared,
     }  # fmt: skip
     programs = [[Program(PROBE, environment=where)] * len(names) for names, where in groups.items()]
-    found = run_warm(["torch"], *programs)
+    found = run_warm(Stage(["torch"], programs))
     return dict(zip((name for names in groups for name in names), found, strict=True))
 
 

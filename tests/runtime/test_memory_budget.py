@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 from support import TESTS_ON_PATH, limited_stages
 from support.tiny_capture import camera_poses, quaternion
-from support.warm_starts import Ended, Program, run_warm
+from support.warm_starts import Ended, Program, Stage, run_warm
 
 from lexsplat import cli
 from lexsplat.captures.sfm import feature_budget
@@ -111,7 +111,7 @@ def builds(large_capture, tmp_path_factory) -> dict[str, Ended]:
     }
     programs["without"] = build(large_capture, folder / "other", "--memory", "8GB")
     threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
-    ended = run_warm(USED, *([program] for program in programs.values()), environment=threads)
+    ended = run_warm(Stage(USED, [[program] for program in programs.values()]), environment=threads)
     return dict(zip(programs, ended, strict=True))
 
 

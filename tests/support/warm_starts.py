@@ -46,23 +46,33 @@ class Ended:
     err: str
 
 
-def run_warm(
-    libraries: Sequence[str], *groups: Sequence[Program], environment: Mapping[str, str] = NONE
-) -> list[Ended]:
-    """Run programs that find some libraries imported.
+@dataclass(frozen=True)
+class Stage:
+    """Programs that find some libraries imported.
 
     Args:
-        libraries: Modules to import before the forks; an import must start no thread.
-        *groups: Programs that run at the same time; the groups run one after the other.
+        libraries: Modules to import before the forks, beside those of the stages before; an import must start no
+            thread.
+        groups: Programs that run at the same time; the groups run one after the other.
+    """
+
+    libraries: Sequence[str]
+    groups: Sequence[Sequence[Program]]
+
+
+def run_warm(*stages: Stage, environment: Mapping[str, str] = NONE) -> list[Ended]:
+    """Run programs in forks of one process; what a stage has imported stays for the next.
+
+    Args:
+        *stages: What to import, and what to run then.
         environment: Variables that are set before the imports.
 
     Returns:
         The ends of all programs, in the order given.
     """
-    task = {"libraries": list(libraries), "groups": [[asdict(one) for one in group] for group in groups]}
     done = subprocess.run(
         [sys.executable, __file__],
-        input=json.dumps(task),
+        input=json.dumps([asdict(stage) for stage in stages]),
         capture_output=True,
         text=True,
         timeout=900,
@@ -97,22 +107,27 @@ def _start(program: Program, outputs: tuple[str, str]) -> int:
         os._exit(status)
 
 
+def _run_together(group: list[dict], folder: str) -> list[Ended]:
+    running, ended = [], []
+    for number, one in enumerate(group):
+        outputs = (f"{folder}/{number}.out", f"{folder}/{number}.err")
+        running.append((_start(Program(**one), outputs), outputs))
+    for child, outputs in running:
+        _, status = os.waitpid(child, 0)
+        texts = [Path(path).read_text(errors="replace") for path in outputs]
+        ended.append(Ended(os.waitstatus_to_exitcode(status), *texts))
+    return ended
+
+
 def main() -> None:
-    task = json.load(sys.stdin)
     sys.path[0] = ""  # as of `python -c`; it was the folder of this file
-    for name in task["libraries"]:
-        importlib.import_module(name)
     ended = []
-    with tempfile.TemporaryDirectory() as folder:
-        for group in task["groups"]:
-            running = []
-            for one in group:
-                outputs = tuple(f"{folder}/{len(ended)}_{len(running)}.{name}" for name in ("out", "err"))
-                running.append((_start(Program(**one), outputs), outputs))
-            for child, outputs in running:
-                _, status = os.waitpid(child, 0)
-                texts = [Path(path).read_text(errors="replace") for path in outputs]
-                ended.append(asdict(Ended(os.waitstatus_to_exitcode(status), *texts)))
+    for stage in json.load(sys.stdin):
+        for name in stage["libraries"]:
+            importlib.import_module(name)
+        for group in stage["groups"]:
+            with tempfile.TemporaryDirectory() as folder:
+                ended += map(asdict, _run_together(group, folder))
     print(json.dumps(ended))
 
 
