@@ -377,16 +377,25 @@ def _pixels(crop: Image.Image, side: int) -> NDArray[np.float32]:
 def thing_crops(capture: Path, side: int) -> tuple[Tensor, list[str]]:
     """Crops ``[M, 3, side, side]`` at the middle of each mask of a capture, and their prompts."""
     crops, prompts = [], []
-    for path in sorted(capture.glob("segmentations/*/*.png")):
-        photo = Image.open(capture / "images" / f"{path.parent.name}.jpg").convert("RGB")
-        inside = np.asarray(Image.open(path).convert("L")) > 127
-        depth = distance_transform_edt(inside)
-        y, x = np.unravel_index(int(depth.argmax()), depth.shape)
-        size = int(np.clip(2 * depth.max(), 0.075 * photo.height, 0.275 * photo.height))
-        left, top = (int(np.clip(c - size // 2, 0, n - size)) for c, n in zip((x, y), photo.size))
-        crops.append(_pixels(photo.crop((left, top, left + size, top + size)), side))
-        prompts.append(path.stem.replace("_", " "))
+    for folder in sorted(capture.glob("segmentations/*/")):
+        photo = Image.open(capture / "images" / f"{folder.name}.jpg").convert("RGB")
+        for path in sorted(folder.glob("*.png")):
+            (x, y), depth = _deepest(np.asarray(Image.open(path).convert("L")) > 127)
+            size = int(np.clip(2 * depth, 0.075 * photo.height, 0.275 * photo.height))
+            left, top = (int(np.clip(c - size // 2, 0, n - size)) for c, n in zip((x, y), photo.size))
+            crops.append(_pixels(photo.crop((left, top, left + size, top + size)), side))
+            prompts.append(path.stem.replace("_", " "))
     return torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2), prompts
+
+
+def _deepest(inside: NDArray[np.bool_]) -> tuple[tuple[int, int], float]:
+    """Column and row of the pixel of a mask that is farthest from its outside, and how far it is."""
+    rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
+    # The nearest pixel outside is at most one beyond the box of the mask.
+    first = max(rows[0] - 1, 0), max(columns[0] - 1, 0)
+    depth = distance_transform_edt(inside[first[0] : rows[-1] + 2, first[1] : columns[-1] + 2])
+    row, column = np.unravel_index(int(depth.argmax()), depth.shape)
+    return (int(first[1] + column), int(first[0] + row)), float(depth.max())
 
 
 def _mean_off_diagonal(matrix: Tensor) -> float:

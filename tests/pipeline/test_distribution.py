@@ -19,7 +19,7 @@ from support.blind_workers import BlindWorkers
 from support.color_encoder import ColorClip, ColorDino
 from support.language_scene import make_scene
 from support.schemas import SCHEMAS
-from support.tiny_capture import QUICK_BUILD
+from support.tiny_capture import QUICK_BUILD, write_capture
 
 from lexsplat import cli
 from lexsplat.captures import Capture, load_capture
@@ -173,12 +173,9 @@ def opened(workers, given, paths=()):
 
 
 @pytest.mark.slow
-def test_relative_paths_serve_workers_with_another_working_folder(
-    tiny_capture, tmp_path, monkeypatch, capsys
-):
-    for name in ("capture", "elsewhere"):
-        (tmp_path / name).mkdir()
-    shutil.copytree(tiny_capture, tmp_path / "capture", dirs_exist_ok=True)
+def test_relative_paths_serve_workers_with_another_working_folder(tmp_path, monkeypatch, capsys):
+    (tmp_path / "elsewhere").mkdir()
+    write_capture(tmp_path / "capture", views=6)
     monkeypatch.chdir(tmp_path)
     workers = ElsewhereWorkers(tmp_path / "elsewhere")
     monkeypatch.setattr(build, "open_workers", functools.partial(opened, workers))
@@ -296,9 +293,9 @@ def test_events_and_warnings_of_scenes_carry_their_names(workers, tmp_path, monk
 
 
 @pytest.mark.slow
-def test_many_captures_make_many_scenes_and_one_that_fails_is_reported(tiny_capture, tmp_path, capsys):
+def test_many_captures_make_many_scenes_and_one_that_fails_is_reported(tmp_path, capsys):
     for name in ("bath", "kitchen"):
-        shutil.copytree(tiny_capture, tmp_path / "captures" / name)
+        write_capture(tmp_path / "captures" / name, views=4)
     (tmp_path / "captures" / "attic").mkdir()
     rooms = [str(path) for path in sorted((tmp_path / "captures").iterdir())]
     arguments = ["build", *rooms, "--output", str(tmp_path / "scenes"), *QUICK_BUILD]

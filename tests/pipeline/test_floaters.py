@@ -33,8 +33,8 @@ def dusty() -> tuple[Gaussians, Gaussians]:
 
 @functools.cache
 def of_dust() -> np.ndarray:
-    """The floaters that are found in `dusty`."""
-    return find_floaters(joined(*dusty()), Path("dusty.ply"))
+    """The floaters that are found in `dusty`, whose up direction is given."""
+    return find_floaters(joined(*dusty()), Path("dusty.ply"), up=UP)
 
 
 @pytest.mark.slow
@@ -72,7 +72,7 @@ def test_large_floaters_hang_in_front_of_surfaces_and_large_gaussians_behind_the
     first = len(clean) + len(dust)
     own = isolation(scene)[1]
     assert (own[first:] < 4).all()
-    floating = find_floaters(scene, Path("dusty.ply"))
+    floating = find_floaters(scene, Path("dusty.ply"), up=UP)
     assert np.isin(np.arange(first, first + 12), floating).mean() > 0.8
     assert not np.isin(np.arange(first + 12, len(scene)), floating).any()
     assert (floating >= len(clean)).all()
@@ -91,7 +91,7 @@ def test_floaters_larger_than_the_things_they_engulf_are_found():
     own = isolation(scene)[1]
     assert (own[len(clean) : len(clean) + 2] < 0.8).all()
     assert (own[-4:] < 2).all()
-    floating = find_floaters(scene, Path("dusty.ply"))
+    floating = find_floaters(scene, Path("dusty.ply"), up=UP)
     assert np.isin(np.arange(len(scene) - 4, len(scene)), floating).all()
     assert (floating >= len(clean) + 2).all()
 
@@ -107,7 +107,7 @@ def test_a_build_leaves_floaters_out_of_the_scene_unless_they_are_kept(tmp_path,
     for keep, count in ((False, len(scene) - len(of_dust())), (True, len(scene))):
         folder = SceneFolder(tmp_path / str(keep))
         folder.root.mkdir()
-        config = BuildConfig(keep_floaters=keep)
+        config = BuildConfig(keep_floaters=keep, up="0,0,1")
         capture = stage.capture_of_splats(splats, folder, config, "cpu", lambda _: None)
         assert len(stage.splats_of_capture(splats, capture, folder)) == count
         assert folder.record["stages"]["views"]["floaters"] == len(scene) - count

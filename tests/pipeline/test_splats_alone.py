@@ -16,7 +16,7 @@ from lexsplat import cli
 from lexsplat.geometry.gaussians import Gaussians, gaussians_from_points
 from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.pipeline.viewpoints import choosing
+from lexsplat.pipeline.viewpoints import candidates, choosing
 from lexsplat.pipeline.viewpoints.looking import look_from_above
 from lexsplat.pipeline.viewpoints.pieces import Pieces
 from lexsplat.pipeline.viewpoints.surroundings import Surroundings, find_surroundings
@@ -35,6 +35,7 @@ solid = partial(made.solid, log_size=0.0)
 def _few_candidates(monkeypatch) -> None:
     """Choices of a test take seconds."""
     monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 60)
+    monkeypatch.setattr(candidates, "_MOST_PLACES", 10)
 
 
 def ball(radius: float = 1.0, count: int = 3000) -> np.ndarray:

@@ -87,13 +87,15 @@ def test_shelves_that_touch_a_wall_as_well_as_the_floor_make_up_a_guess_that_con
     assert not found.contradict(UP)
 
 
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize(
-    "name", [name for name in (FREE | AMBIGUOUS) if name not in ("another library", "one more")]
-)
+DIFFERENT = [name for name in (FREE | AMBIGUOUS) if name not in ("another library", "one more")]
+"""The seed also makes the points, so the three libraries are one."""
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("name", DIFFERENT)
 def test_however_a_room_of_shelves_is_turned_up_is_right_or_a_guess(name, seed):
-    """The seed also makes the points, so the three libraries are one."""
-    turn = Rotation.random(random_state=seed).as_matrix()
+    """No two turns are the same."""
+    turn = Rotation.random(random_state=2 * DIFFERENT.index(name) + seed).as_matrix()
     found = upward(shelves(**{**FREE, **AMBIGUOUS}[name], seed=seed) @ turn.T)
     if found.reliable:
         assert found.directions[0] @ (turn @ UP) > 0.99

@@ -1,12 +1,11 @@
 """What a command loads: nothing that its answer does not need. `benchmarks/start.py` measures the time."""
 
+import functools
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
+from support.warm_starts import Ended, Program, Stage, run_warm
 
 from lexsplat.cli import COMMANDS
 from lexsplat.scenes.library import Library
@@ -51,57 +50,101 @@ ALLOWED = {
 }
 """Libraries that a command may load."""
 
+WARMER = (
+    (), ("tyro", "rich"), ("torch", "numpy"), ("PIL.Image",), ("scipy.ndimage", "scipy.sparse", "scipy.spatial"),
+    ("safetensors.torch",), ("numba",),
+)  # fmt: skip
+"""Libraries in the order in which the process imports them whose forks the programs are.
 
-def loaded(code: str, *arguments: str, place: Path | None = None, **environment: str) -> set[str]:
-    done = subprocess.run(
-        [sys.executable, "-c", f"import json, sys\n{code}\n"
-         "print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})), file=sys.stderr)", *arguments],
-        cwd=place, env={**os.environ, **environment}, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    return set(json.loads(done.stderr.splitlines()[-1])) & LIBRARIES
+A program may find imported what it may load: then its own imports of that prove nothing.
+"""
+QUICK = 2
+"""Stages that import nothing large."""
+
+REPORT = """
+import json, sys
+print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})), file=sys.stderr)
+"""
+COMMAND = """
+from lexsplat.__main__ import main
+try:
+    assert main() == 0
+except SystemExit:
+    pass
+"""
+IMPORT, OPEN = "import lexsplat", "import lexsplat; lexsplat.open_scene('demo', device='cpu')"
+
+EXPECTED: dict[tuple[str, ...], tuple[str, set[str]]] = {
+    **{(name, "--help"): (COMMAND, HELP_PAGES.get(name, set()) | HELP) for name in COMMANDS},
+    **{words: (COMMAND, libraries) for words, libraries in ALLOWED.items()},
+    (IMPORT,): (IMPORT, set()),
+    (OPEN,): (OPEN, ANSWER),
+}
+"""Programs, their code, and the libraries that they may load."""
 
 
-def command(*words: str, place: Path | None = None) -> set[str]:
-    code = "from lexsplat.__main__ import main\ntry: assert main() == 0\nexcept SystemExit: pass"
-    return loaded(code, *words, place=place, COLUMNS="80")
+def stage_of(words: tuple[str, ...]) -> int:
+    """The last stage before which only libraries are imported that a program may load."""
+    allowed = EXPECTED[words][1]
+    fits = [{name.partition(".")[0] for name in names} <= allowed for names in WARMER]
+    return (*fits, False).index(False) - 1
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    """A working directory with a library of the bundled scene, "rooms"."""
-    folder = tmp_path_factory.mktemp("place")
-    Library.create(folder / "rooms", device="cpu").add("demo")
-    return folder
+def surplus(tmp_path_factory) -> Callable[..., set[str]]:
+    """The libraries that a program loads beyond what it may.
+
+    Programs share a working directory with a library of the bundled scene, "rooms".
+    """
+    place = tmp_path_factory.mktemp("place")
+    Library.create(place / "rooms", device="cpu").add("demo")
+
+    @functools.cache
+    def ended(quick: bool) -> dict[tuple[str, ...], Ended]:
+        names, stages = [], []
+        for number in range(QUICK) if quick else range(len(WARMER)):
+            here = [words for words in EXPECTED if stage_of(words) == number and (number < QUICK) is quick]
+            programs = [Program(EXPECTED[w][0] + REPORT, w, str(place), {"COLUMNS": "80"}) for w in here]
+            names += here
+            stages.append(Stage(WARMER[number], [[program] for program in programs]))
+        return dict(zip(names, run_warm(*stages), strict=True))
+
+    def of(*words: str) -> set[str]:
+        done = ended(stage_of(words) < QUICK)[words]
+        assert done.status == 0, done.err
+        return set(json.loads(done.err.splitlines()[-1])) & LIBRARIES - EXPECTED[words][1]
+
+    return of
 
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in HELP_PAGES])
-def test_help_pages_without_settings_load_no_library_of_the_work(name):
-    assert command(name, "--help") <= HELP
+def test_help_pages_without_settings_load_no_library_of_the_work(surplus, name):
+    assert surplus(name, "--help") == set()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", HELP_PAGES)
-def test_help_pages_with_settings_load_what_the_settings_need(name):
-    assert command(name, "--help") <= HELP_PAGES[name]
+def test_help_pages_with_settings_load_what_the_settings_need(surplus, name):
+    assert surplus(name, "--help") == set()
 
 
 @pytest.mark.parametrize("words", [w for w, libraries in ALLOWED.items() if libraries <= HELP], ids=" ".join)
-def test_the_overview_and_wrong_usage_load_no_library_of_the_work(words):
-    assert command(*words) <= ALLOWED[words]
+def test_the_overview_and_wrong_usage_load_no_library_of_the_work(surplus, words):
+    assert surplus(*words) == set()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "words", [w for w, libraries in ALLOWED.items() if not libraries <= HELP], ids=" ".join
 )
-def test_a_command_loads_what_its_answer_needs_and_no_more(words, place):
-    assert command(*words, place=place) <= ALLOWED[words]
+def test_a_command_loads_what_its_answer_needs_and_no_more(surplus, words):
+    assert surplus(*words) == set()
 
 
-def test_importing_lexsplat_loads_no_library():
-    assert loaded("import lexsplat") == set()
+def test_importing_lexsplat_loads_no_library(surplus):
+    assert surplus(IMPORT) == set()
 
 
 @pytest.mark.slow
-def test_opening_a_scene_loads_no_structure_from_motion_and_no_transformers():
-    assert loaded("import lexsplat; lexsplat.open_scene('demo', device='cpu')") <= ANSWER
+def test_opening_a_scene_loads_no_structure_from_motion_and_no_transformers(surplus):
+    assert surplus(OPEN) == set()

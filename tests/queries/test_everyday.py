@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from web_like import Facts, general_phrases, make_web_like, measure
+from scipy.ndimage import distance_transform_edt
+from web_like import Facts, _deepest, general_phrases, make_web_like, measure
 
 from lexsplat.queries.everyday import BORDER, STEEPNESS, EverydayScale, everyday_words
 from lexsplat.queries.relevancy import QueryConfig, Question, code_relevancy
@@ -93,6 +94,16 @@ def test_the_words_are_about_a_thousand_different_ones():
     words = everyday_words()
     assert 900 < len(words) == len(set(words)) < 1300
     assert all(word == " ".join(word.split()) and word for word in words)
+
+
+@pytest.mark.parametrize("low", [(0, 0), (3, 7), (0, 5)], ids=["corner", "middle", "edge"])
+def test_the_deepest_pixel_of_a_mask_is_that_of_the_whole_picture(low):
+    mask = np.zeros((40, 50), bool)
+    mask[low[0] : low[0] + 21, low[1] : low[1] + 15] = np.random.default_rng(0).random((21, 15)) < 0.97
+    depth = distance_transform_edt(mask)
+    (column, row), deepest = _deepest(mask)
+    assert deepest == depth.max()
+    assert (row, column) == np.unravel_index(int(depth.argmax()), depth.shape)
 
 
 @pytest.fixture(scope="module")

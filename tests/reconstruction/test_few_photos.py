@@ -37,9 +37,10 @@ def test_an_added_point_has_the_depth_of_the_nearest_known_point_in_its_photo_an
         for place, depth in shown
         if 0 <= place[0] < camera.width and 0 <= place[1] < camera.height
     ]
+    places = np.stack([place for place, _ in shown])
     for point, color in zip(found.points[known:].astype(np.float64), found.colors[known:]):
         place, depth = project(point)
-        distances = [np.linalg.norm(place - other) for other, _ in shown]
+        distances = np.linalg.norm(places - place, axis=1)
         assert depth == pytest.approx(shown[int(np.argmin(distances))][1], rel=1e-4)
         u, v = place
         assert color == pytest.approx(photo[int(v), int(u)], abs=0.02) or min(u % 1, v % 1) < 1e-3

@@ -1,15 +1,13 @@
 """Compiled kernels are kept in a folder that can be written, and compilation is announced once."""
 
 import logging
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 from numba.core.caching import NullCache
+from support.warm_starts import Ended, Program, Stage, run_warm
 
 pytestmark = pytest.mark.slow
 
@@ -25,39 +23,51 @@ print("at", binning.offsets_of.stats.cache_path)
 """
 
 
-def run_probe(**environment: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-c", PROBE],
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return done.stdout
+OTHER_PROCESSOR = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 
 
-def test_compiled_kernels_are_reused_from_numba_cache_dir(tmp_path):
-    first, second = run_probe(NUMBA_CACHE_DIR=str(tmp_path)), run_probe(NUMBA_CACHE_DIR=str(tmp_path))
-    assert "compiling CPU kernels, once" in first
-    assert "hits 0" in first
-    assert "hits 1" in second
-    assert str(tmp_path) in second
+@pytest.fixture(scope="module")
+def kernels(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("kernels")
 
 
-def test_kernels_cached_for_another_processor_are_recompiled(tmp_path):
+@pytest.fixture(scope="module")
+def runs(kernels) -> dict[str, Ended]:
+    """Processes that call a kernel one after the other; the last three, of which two run at once, share a folder."""
+    here, shared = ({"NUMBA_CACHE_DIR": str(kernels / name)} for name in ("one", "shared"))
+    groups = {
+        ("first",): here, ("again",): here, ("elsewhere",): here | OTHER_PROCESSOR, ("back",): here,
+        ("left", "right"): shared, ("after both",): shared,
+    }  # fmt: skip
+    programs = [[Program(PROBE, environment=where)] * len(names) for names, where in groups.items()]
+    found = run_warm(Stage(["torch"], programs))
+    return dict(zip((name for names in groups for name in names), found, strict=True))
+
+
+def test_compiled_kernels_are_reused_from_numba_cache_dir(runs, kernels):
+    assert "compiling CPU kernels, once" in runs["first"].out
+    assert "hits 0" in runs["first"].out
+    assert "hits 1" in runs["again"].out
+    assert str(kernels / "one") in runs["again"].out
+
+
+def test_kernels_cached_for_another_processor_are_recompiled(runs):
     # As with a home folder on a network, or a disk moved to another machine.
-    here = {"NUMBA_CACHE_DIR": str(tmp_path)}
-    run_probe(**here)
-    other = run_probe(**here, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="")
-    assert "compiling CPU kernels, once" in other
-    assert "hits 0" in other
-    assert "hits 1" in run_probe(**here)
+    assert "compiling CPU kernels, once" in runs["elsewhere"].out
+    assert "hits 0" in runs["elsewhere"].out
+    assert "hits 1" in runs["back"].out
 
 
-def test_kernels_that_are_not_compiled_are_not_announced(tmp_path):
+def test_kernels_that_are_not_compiled_are_not_announced(runs):
     # A viewer never compiles the kernels of gradients.
-    assert "compiling" in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
-    assert "compiling" not in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
+    assert "hits 1" in runs["again"].out
+    assert "compiling" not in runs["again"].out
+
+
+def test_two_processes_can_compile_at_the_same_time(runs):
+    for name in ("left", "right"):
+        assert (runs[name].status, runs[name].err) == (0, "")
+    assert "hits 1" in runs["after both"].out
 
 
 def test_only_compilation_of_this_packages_kernels_is_announced_once(monkeypatch, caplog):
@@ -75,18 +85,6 @@ def test_only_compilation_of_this_packages_kernels_is_announced_once(monkeypatch
             fresh._cache = NullCache()
             fresh(0, 2, image, image, products)
     assert [record.message for record in caplog.records] == ["compiling CPU kernels, once (about 15 seconds)"]
-
-
-def test_two_processes_can_compile_at_the_same_time(tmp_path):
-    command = [sys.executable, "-c", PROBE]
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    both = [
-        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        for _ in range(2)
-    ]
-    assert [process.communicate()[1] for process in both] == [b"", b""]
-    assert [process.returncode for process in both] == [0, 0]
-    assert "hits 1" in run_probe(NUMBA_CACHE_DIR=str(tmp_path))
 
 
 def test_a_read_only_installation_caches_kernels_in_the_home_folder(tmp_path, monkeypatch):

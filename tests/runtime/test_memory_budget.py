@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 from support import TESTS_ON_PATH, limited_stages
 from support.tiny_capture import camera_poses, quaternion
+from support.warm_starts import Ended, Program, Stage, run_warm
 
 from lexsplat import cli
 from lexsplat.captures.sfm import feature_budget
@@ -35,16 +36,26 @@ BESIDE = 300 * MEGABYTE
 
 BUILD = """
 import json, resource, sys
+from pathlib import Path
 from lexsplat import cli
-import lexsplat.pipeline, lexsplat.rendering.cpu_backend, scipy.ndimage, skimage.measure, pycolmap
 from lexsplat.features.encoders import load_clip
 load_clip("bundled", "cpu").encode_text(["warm"])
 with open("/proc/self/status") as file:
     before = next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmData"))
 limit = before + int(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
-sys.exit(cli.main(sys.argv[2:]))
+status = cli.main(sys.argv[3:])
+if status == 0:
+    print(json.dumps(json.loads(Path(sys.argv[2], "scene.json").read_text())["stages"]))
+sys.exit(status)
 """
+"""Builds under a limit of further memory; the last line of its output is the record of the stages."""
+
+USED = (
+    "lexsplat.cli", "lexsplat.pipeline", "lexsplat.rendering.cpu_backend", "lexsplat.features.encoders",
+    "scipy.ndimage", "skimage.measure", "pycolmap",
+)  # fmt: skip
+"""What a build imports does not count for its limit."""
 
 
 @pytest.fixture(scope="module")
@@ -73,8 +84,9 @@ def large_capture(tmp_path_factory) -> Path:
     return folder
 
 
-def run(capture: Path, output: Path, limit: int, *options: str) -> subprocess.CompletedProcess:
+def build(capture: Path, output: Path, *options: str) -> Program:
     arguments = [
+        str(MEMORY + BESIDE), str(output),
         "build", str(capture), "--output", str(output), "--clip", "bundled", "--dino", "none", "--device", "cpu",
         "--downscale", "1", "--iterations", "44", "--reconstruction.max-gaussians", "400",
         "--reconstruction.warm-up", "0", "--codebook.num-codes", "8", "--codebook.steps", "20",
@@ -82,17 +94,25 @@ def run(capture: Path, output: Path, limit: int, *options: str) -> subprocess.Co
         "--features.crop-sizes", "0.5", "--features.crop-strides", "0.5", "--features.map-cells", "16",
         "--features.max-short-side", "120", *options,
     ]  # fmt: skip
-    environment = {
-        **os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2",
-    }  # fmt: skip
-    command = [sys.executable, "-c", BUILD, str(limit), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=900, env=environment)
+    return Program(BUILD, arguments)
 
 
 @pytest.fixture(scope="module")
-def by_both_methods(tmp_path_factory) -> Path:
-    """Built by one method after the other: a second one keeps the Gaussians."""
-    return tmp_path_factory.mktemp("built") / "scene"
+def builds(large_capture, tmp_path_factory) -> dict[str, Ended]:
+    """What came of builds under the limit: by both methods, of which the second keeps the Gaussians of the first, and
+    without the budget.
+    """
+    if not Path("/proc/self/status").exists():
+        pytest.skip("the hard limit (RLIMIT_DATA) needs Linux")
+    folder = tmp_path_factory.mktemp("built")
+    programs = {
+        method: build(large_capture, folder / "scene", "--memory", f"{MEMORY}", "--method", method)
+        for method in ("averaged", "trained")
+    }
+    programs["without"] = build(large_capture, folder / "other", "--memory", "8GB")
+    threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    ended = run_warm(Stage(USED, [[program] for program in programs.values()]), environment=threads)
+    return dict(zip(programs, ended, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -102,26 +122,20 @@ def by_both_methods(tmp_path_factory) -> Path:
         ("trained", {"reconstruct", "features", "codebook", "language"}),
     ],
 )
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the hard limit (RLIMIT_DATA) needs Linux")
-def test_a_build_stays_under_a_hard_limit_that_its_photos_exceed(
-    large_capture, by_both_methods, method, stages
-):
-    limit = MEMORY + BESIDE
-    assert limit < VIEWS * WIDTH * HEIGHT * 3 * 4, "the decoded photos must not fit"
-    done = run(large_capture, by_both_methods, limit, "--memory", f"{MEMORY}", "--method", method)
-    assert done.returncode == 0, done.stderr[-2000:]
-    record = json.loads((by_both_methods / "scene.json").read_text())["stages"]
+def test_a_build_stays_under_a_hard_limit_that_its_photos_exceed(builds, method, stages):
+    assert MEMORY + BESIDE < VIEWS * WIDTH * HEIGHT * 3 * 4, "the decoded photos must not fit"
+    assert builds[method].status == 0, builds[method].err[-2000:]
+    record = json.loads(builds[method].out.splitlines()[-1])
     assert stages <= record.keys()
     assert record["language"]["method"] == method
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the hard limit (RLIMIT_DATA) needs Linux")
-def test_the_limit_is_one_that_bites(large_capture, tmp_path):
+def test_the_limit_is_one_that_bites(builds):
     """Without the budget the same build ends, in one line, under the same limit."""
-    done = run(large_capture, tmp_path / "scene", MEMORY + BESIDE, "--memory", "8GB")
-    assert done.returncode == 1, done.stderr[-2000:]
-    assert "Traceback" not in done.stderr
-    assert "error: " in done.stderr.splitlines()[-1]
+    done = builds["without"]
+    assert done.status == 1, done.err[-2000:]
+    assert "Traceback" not in done.err
+    assert "error: " in done.err.splitlines()[-1]
 
 
 def test_memory_does_not_affect_the_result():

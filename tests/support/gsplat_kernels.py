@@ -12,12 +12,15 @@ blending, through the forward pass in this file. Tensors are either all on the C
 
 from __future__ import annotations
 
+import functools
 import sys
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._mode_utils import no_dispatch
 
 from support.pretended_gpu import PretendedTensor, inner, wrapped
 
@@ -47,6 +50,24 @@ def taken(*tensors: Tensor | None, names: str = "") -> tuple[Any, ...]:
     return tuple(None if tensor is None else inner(tensor).detach() for tensor in tensors)
 
 
+def compiled(kernels: type) -> type:
+    """A class whose functions are to the pretended GPU as compiled code: none of their operations is looked at."""
+
+    def hidden(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def run(*args: Any) -> Any:
+            with no_dispatch():
+                return function(*args)
+
+        return run
+
+    for name, member in list(vars(kernels).items()):
+        if callable(member) and not name.startswith("_"):
+            setattr(kernels, name, hidden(member))
+    return kernels
+
+
+@compiled
 class Extension:
     """The functions of the extension that rendering and density control call."""
 

@@ -1,9 +1,9 @@
 """Repeats a build in processes that are killed, until the scene is finished.
 
-test_killed_builds.py runs this module in a separate process, with one thread and without a GPU. It builds the scene
-once undisturbed, and every further attempt is a fork: no module is imported and no kernel is loaded again. No thread
-is left at the forks. The first kill of a scene strikes inside one of the stages, at a progress event; the others
-strike at random moments.
+test_killed_builds.py runs this module in a separate process, with one thread and without a GPU. By each method it
+builds the scene once undisturbed, and every further attempt is a fork: no module is imported and no kernel is loaded
+again. No thread is left at the forks. The first kill of a scene strikes inside one of the stages, at a progress
+event; the others strike at random moments.
 """
 
 from __future__ import annotations
@@ -65,20 +65,20 @@ def attempt(
     return outcome(child, seconds)
 
 
-def main() -> None:
-    folder, kills, seed, stages, *options = sys.argv[1:]
+def killed(folder: Path, method: str, stages: list[str], options: list[str]) -> dict:
+    """Build a scene with a method, then as many as it has stages in forks that are killed; report what happened."""
     from lexsplat import cli
 
-    rng, names = np.random.default_rng(int(seed)), stages.split(",")
-    undisturbed = str(Path(folder) / "undisturbed")
-    report = {"killed_inside": [], "kills": 0, "finished": [], "undisturbed": undisturbed}
+    rng, options = np.random.default_rng(3), [*options, "--method", method]
+    undisturbed = str(folder / "undisturbed")
+    report: dict = {"killed_inside": [], "kills": 0, "finished": [], "undisturbed": undisturbed}
     with contextlib.redirect_stdout(io.StringIO()):
         if cli.main([*options, "--output", undisturbed]):
             report["failed"] = undisturbed
-    while report["kills"] < int(kills) and "failed" not in report:
-        output = Path(folder) / f"scene_{len(report['finished'])}"
+    while report["kills"] < KILLS_A_SCENE * len(stages) and "failed" not in report:
+        output = folder / f"scene_{len(report['finished'])}"
         arguments = [*options, "--output", str(output)]
-        stage, share = names[len(report["finished"]) % len(names)], float(rng.uniform())
+        stage, share = stages[len(report["finished"]) % len(stages)], float(rng.uniform())
         result = attempt(arguments, prepare=lambda stage=stage, share=share: kill_inside(stage, share))
         if result == "killed":
             report["killed_inside"].append(stage)
@@ -94,7 +94,13 @@ def main() -> None:
             report["failed"] = str(output)
         else:
             report["finished"].append(str(output))
-    print(json.dumps(report))
+    return report
+
+
+def main() -> None:
+    folder, methods, *options = sys.argv[1:]
+    stages = json.loads(methods)
+    print(json.dumps({m: killed(Path(folder) / m, m, names, options) for m, names in stages.items()}))
 
 
 if __name__ == "__main__":

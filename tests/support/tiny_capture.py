@@ -16,7 +16,7 @@ SPHERES = {  # name: center, radius, color
 }
 QUICK_BUILD = [
     "--clip", "bundled", "--dino", "bundled", "--device", "cpu", "--iterations", "120",
-    "--features.crop-sizes", "0.18", "0.36", "--features.crop-strides", "0.5", "0.5",
+    "--features.crop-sizes", "0.25", "0.5", "--features.crop-strides", "0.5", "0.5",
     "--codebook.num-codes", "16", "--trained.iterations", "60",
 ]  # fmt: skip
 """Options of ``lexsplat build`` that make a small scene of the capture in seconds."""

@@ -86,5 +86,5 @@ def checkpoints() -> Reader:
 
     return Reader(
         make, read, check,
-        {"state": lambda c, rng: [*mutate.safetensors(c, rng, 30, 120), *mutate.tensors(c, rng, 120)]},
+        {"state": lambda c, rng: [*mutate.safetensors(c, rng, 30, 60), *mutate.tensors(c, rng, 70)]},
     )  # fmt: skip

@@ -57,5 +57,5 @@ def reconstruction_checkpoints() -> Reader:
 
     return Reader(
         make, read, check,
-        {"state": lambda c, rng: [*mutate.safetensors(c, rng, 30, 150), *mutate.tensors(c, rng, 150)]},
+        {"state": lambda c, rng: [*mutate.safetensors(c, rng, 30, 80), *mutate.tensors(c, rng, 80)]},
     )  # fmt: skip

@@ -21,7 +21,7 @@ import time
 import warnings
 from collections import Counter
 from dataclasses import dataclass, field
-from itertools import islice
+from io import RawIOBase
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,8 @@ SECONDS = 5.0
 GIGABYTE = 1 << 30
 BASE_BYTES = 3 << 28
 """Memory of the process before any input: torch, Numba's kernels and other libraries."""
+NAME_BYTES = 120
+"""Names are padded: a file that is emptied and written again waits for the disk each time."""
 
 
 PYTHON = re.compile(
@@ -110,8 +112,8 @@ def attempt(target: Reader, folder: Path, report: Report, about: str, whole: byt
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
-def run_reader(name: str, work: Path, current: Path, *, every: int = 1) -> Report:
-    """Run every n-th mutation of one reader; the file ``current`` names the one in progress."""
+def run_reader(name: str, work: Path, tried: RawIOBase) -> Report:
+    """Run the mutations of one reader; the file ``tried`` begins with the name of the one in progress."""
     target, report = READERS[name](), Report()
     folder = work / name
     folder.mkdir(parents=True)
@@ -125,10 +127,10 @@ def run_reader(name: str, work: Path, current: Path, *, every: int = 1) -> Repor
     for number, (file, mutations) in enumerate(target.mutations.items()):
         path = folder / file
         content = path.read_bytes()
-        all_of_them = mutations(content, np.random.default_rng(number))
-        for index, (kind, changed) in enumerate(islice(all_of_them, 0, None, every)):
+        for index, (kind, changed) in enumerate(mutations(content, np.random.default_rng(number))):
             about = f"{name} {file} {kind} {index}"
-            current.write_text(about)
+            tried.seek(0)
+            tried.write(about.ljust(NAME_BYTES).encode())
             path.write_bytes(changed)
             report.inputs += 1
             report.kinds[kind] += 1
@@ -172,8 +174,8 @@ def main() -> None:
         if not _claim(claims / name):
             continue
         start = time.process_time()
-        with contextlib.redirect_stdout(sys.stderr):
-            report = run_reader(name, work, output.with_suffix(".current"))
+        with contextlib.redirect_stdout(sys.stderr), open(output.with_suffix(".current"), "wb", 0) as tried:
+            report = run_reader(name, work, tried)
         report.peak = _peak()
         report.seconds = round(time.process_time() - start, 2)
         reports[name] = report.data()

@@ -69,8 +69,8 @@ def scene_folder() -> Reader:
     return Reader(
         make_folder, open_folder, check_open_scene,
         {
-            "scene.json": lambda content, rng: mutate.json_file(content, rng, 60, 500),
-            "cameras.json": lambda content, rng: mutate.json_file(content, rng, 60, 600),
+            "scene.json": lambda content, rng: mutate.json_file(content, rng, 40, 250),
+            "cameras.json": lambda content, rng: mutate.json_file(content, rng, 40, 300),
             "gaussians.ply": lambda content, rng: mutate.binary(content, rng, 40, 60),
             "language.safetensors": language_file,
         },
@@ -79,15 +79,15 @@ def scene_folder() -> Reader:
 
 
 def language_file(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-    yield from mutate.safetensors(content, rng, 100, 400)
-    yield from mutate.tensors(content, rng, 150)
+    yield from mutate.safetensors(content, rng, 50, 200)
+    yield from mutate.tensors(content, rng, 80)
 
 
 @reader
 def trained_scene_folder() -> Reader:
     return Reader(
         lambda folder: make_folder(folder, trained=True), open_folder, check_open_scene,
-        {"language.safetensors": lambda content, rng: mutate.tensors(content, rng, 200)},
+        {"language.safetensors": lambda content, rng: mutate.tensors(content, rng, 100)},
     )  # fmt: skip
 
 
@@ -137,14 +137,14 @@ def journal() -> Reader:
 
     def lines(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
         yield from mutate.truncated(content, 250)
-        yield from mutate.flipped(content, rng, 150)
+        yield from mutate.flipped(content, rng, 80)
         yield from mutate.shifted(content, rng, 60)
         yield from mutate.foreign(content)
         parts = content.decode().splitlines()
         for row, line in enumerate(parts):
             yield "lines", "\n".join([*parts[:row], *parts[row + 1 :], ""]).encode()
             yield "lines", "\n".join([*parts[:row], line, *parts[row:], ""]).encode()
-            for kind, changed in mutate.structure(json.loads(line), rng, 120):
+            for kind, changed in mutate.structure(json.loads(line), rng, 60):
                 yield (
                     kind,
                     "\n".join(

@@ -59,9 +59,9 @@ def splat_ply() -> Reader:
 
     def headers(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
         end = content.index(b"end_header\n") + 11
-        yield from mutate.binary(content, rng, 250, 500)
-        yield from mutate.overwritten(content, rng, 250, start=end)
-        for kind, changed in mutate.text(content[:end], rng, 200, 0):
+        yield from mutate.binary(content, rng, 150, 500)
+        yield from mutate.overwritten(content, rng, 150, start=end)
+        for kind, changed in mutate.text(content[:end], rng, 120, 0):
             yield kind, changed + content[end:]
         for count in (5, 10**6, 10**9, 2**63, 10**30):
             yield "counts", content.replace(b"element vertex 4", b"element vertex %d" % count)
@@ -148,7 +148,7 @@ def splat_text_ply() -> Reader:
         (folder / "a.ply").write_bytes(recounted_text((folder / "a.ply").read_bytes(), 4))
 
     def mutations(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-        yield from mutate.text(content, rng, 600, 500)
+        yield from mutate.text(content, rng, 300, 300)
         for count in (5, 10**6, 10**9, 2**63, 10**30):
             yield "counts", content.replace(b"element vertex 4", b"element vertex %d" % count)
         yield from recounted(content, FEWER, b"element vertex 4")
@@ -178,7 +178,7 @@ def spz(version: int) -> Callable[[], Reader]:
             for changed in recounted_spz(raw):
                 yield "recounted", gzip.compress(changed, 1) if version < 4 else changed
             if version < 4:
-                for kind, changed in mutate.binary(gzip.decompress(content), rng, 400, 500):
+                for kind, changed in mutate.binary(gzip.decompress(content), rng, 200, 500):
                     # Cut before it is compressed, the file is complete and too short.
                     yield "moved" if kind == "truncated" else kind, gzip.compress(changed, 1)
 
@@ -201,7 +201,7 @@ def sog() -> Reader:
     from lexsplat.scenes.formats.sog_writing import write_sog
 
     def mutations(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-        yield from mutate.binary(content, rng, 500, 500)
+        yield from mutate.binary(content, rng, 250, 300)
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             parts = {name: archive.read(name) for name in archive.namelist()}
         document = json.loads(parts["meta.json"])
@@ -231,11 +231,11 @@ def sog_folder() -> Reader:
             archive.extractall(folder)
 
     def picture(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-        yield from mutate.binary(content, rng, 100, 60)
+        yield from mutate.binary(content, rng, 40, 30)
 
     names = ("means_l", "means_u", "quats", "scales", "sh0", "shN_centroids", "shN_labels")
     parts = {f"{name}.webp": picture for name in names}
-    parts["meta.json"] = lambda content, rng: mutate.json_file(content, rng, 150, 1200)
+    parts["meta.json"] = lambda content, rng: mutate.json_file(content, rng, 80, 600)
     return SplatReader(make, read_splats, check_gaussians, parts)
 
 
@@ -250,7 +250,7 @@ def sog_version_1() -> Reader:
     }
 
     def counts(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-        yield from mutate.json_file(content, rng, 150, 800)
+        yield from mutate.json_file(content, rng, 80, 400)
         document = json.loads(content)
         for count in (*range(10), 11, 12):
             document["means"]["shape"] = [count, 3]
@@ -271,7 +271,7 @@ def sog_streamed() -> Reader:
     return SplatReader(
         lambda folder: write_streamed(folder, {"0_0": 10, "1_0": 5}, tree),
         read_splats, check_gaussians,
-        {"lod-meta.json": lambda content, rng: mutate.json_file(content, rng, 150, 1200)},
+        {"lod-meta.json": lambda content, rng: mutate.json_file(content, rng, 80, 600)},
     )  # fmt: skip
 
 
@@ -281,11 +281,11 @@ def glb() -> Reader:
     from lexsplat.scenes.formats.reading import read_splats
 
     def mutations(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-        yield from mutate.binary(content, rng, 300, 300)
+        yield from mutate.binary(content, rng, 150, 300)
         (length,) = struct.unpack_from("<I", content, 12)
         document, binary = json.loads(content[20 : 20 + length]), content[20 + length :]
         document["asset"]["generator"] = "another"  # so that its nodes count
-        for kind, text in mutate.structure(document, rng, 2500):
+        for kind, text in mutate.structure(document, rng, 1000):
             text += b" " * (-len(text) % 4)
             head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(binary), len(text), b"JSON")
             yield kind, head + text + binary
@@ -319,8 +319,8 @@ def gltf() -> Reader:
         (folder / "a.glb").unlink()
 
     parts = {
-        "a.gltf": lambda content, rng: mutate.json_file(content, rng, 100, 1000),
-        "a.bin": lambda content, rng: mutate.binary(content, rng, 100, 100),
+        "a.gltf": lambda content, rng: mutate.json_file(content, rng, 60, 500),
+        "a.bin": lambda content, rng: mutate.binary(content, rng, 60, 100),
     }
     return SplatReader(make, lambda folder: read_splats(folder / "a.gltf"), check_gaussians, parts)
 
