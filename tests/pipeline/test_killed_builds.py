@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def reports(tmp_path_factory) -> dict[str, dict]:
+def killed(tmp_path_factory) -> dict[str, dict]:
     """By method, what came of builds that spend most of their time in trainings, which have the most to lose."""
     folder = tmp_path_factory.mktemp("killed")
     capture = write_capture(folder / "capture", views=6, width=64, height=48)
@@ -53,10 +53,10 @@ def tensors(scene: Path):
 
 
 @pytest.mark.parametrize("method", STAGES)
-def test_kills_over_all_stages_do_not_change_the_result(reports, method):
+def test_kills_over_all_stages_do_not_change_the_result(killed, method):
     import torch
 
-    report = reports[method]
+    report = killed[method]
     assert "failed" not in report
     assert report["kills"] >= KILLS_A_SCENE * len(STAGES[method])
     assert set(report["killed_inside"]) == set(STAGES[method])
