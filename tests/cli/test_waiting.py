@@ -53,6 +53,42 @@ def test_a_quick_stage_within_a_slow_one_does_not_end_its_progress(capsys, monke
     listener(Event("page", 6, 6))
 
 
+def test_quick_stages_within_a_slow_one_are_not_shown_and_slow_ones_are(capsys, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    listener = LateProgress()
+    listener(Event("page", 0, 6))
+    now[0] += 3.0
+    listener(Event("page", 1, 6))
+    for _ in range(20):  # each of one word
+        listener(Event("words", 0, 1))
+        listener(Event("words", 1, 1))
+    said = capsys.readouterr().err
+    assert "page: 1/6" in said
+    assert "words" not in said
+    listener(Event("words", 0, 2))
+    now[0] += 5.0
+    listener(Event("words", 1, 2))
+    listener(Event("words", 2, 2))
+    assert "words: 2/2" in capsys.readouterr().err
+    listener(Event("page", 6, 6))
+
+
+def test_a_silent_stage_within_a_slow_one_is_shown_after_the_time(capsys):
+    listener = LateProgress(patience=0.05)
+    listener(Event("page", 0, 6))
+    said = ""
+    for stage in ("page", "export"):
+        listener(Event("export", 0, 1))
+        deadline = time.monotonic() + 20
+        while f"{stage}: 0" not in said and time.monotonic() < deadline:
+            time.sleep(0.02)
+            said += capsys.readouterr().err
+        assert f"{stage}: 0" in said
+    listener(Event("export", 1, 1))
+    listener(Event("page", 6, 6))
+
+
 def test_a_stage_that_failed_does_not_show_its_next_run_too_early(capsys, monkeypatch):
     now = [100.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
