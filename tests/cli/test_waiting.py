@@ -1,6 +1,10 @@
 """Progress of commands that are mostly quick."""
 
+import signal
 import time
+from contextlib import suppress
+
+import pytest
 
 from lexsplat.cli import waiting
 from lexsplat.cli.waiting import LateProgress
@@ -113,3 +117,35 @@ def test_imports_that_take_long_are_shown_with_the_time_so_far_and_quick_ones_ar
             time.sleep(0.02)
     assert "so far" in said
     assert "start: took 0:0" in capsys.readouterr().err
+
+
+@pytest.fixture
+def ctrl_c():
+    """Ctrl-C as in a terminal: a job in the background starts with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield lambda: signal.raise_signal(signal.SIGINT)
+    signal.signal(signal.SIGINT, before)
+
+
+def swallow(ctrl_c):
+    """What torch makes of it while it imports numpy."""
+    with suppress(KeyboardInterrupt):
+        ctrl_c()
+
+
+def fail_after(ctrl_c):
+    swallow(ctrl_c)
+    raise ImportError("cannot load module more than once per process")
+
+
+@pytest.mark.parametrize("module", [swallow, fail_after])
+def test_ctrl_c_ends_the_loading_whatever_a_module_makes_of_it(module, ctrl_c):
+    with pytest.raises(KeyboardInterrupt), waiting.loading():
+        module(ctrl_c)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_error_of_loading_without_ctrl_c_stays(ctrl_c):
+    with pytest.raises(ImportError, match="no module"), waiting.loading():
+        raise ImportError("no module named torch")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import atexit
+import signal
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import TYPE_CHECKING
 
 from lexsplat.runtime.lazy import without_collection
@@ -99,5 +101,37 @@ class LateProgress:
 @contextmanager
 def starting() -> Iterator[None]:
     """Import in this block what a command needs; the time so far is shown after two seconds."""
-    with uncounted(LateProgress(), "start"), without_collection():
+    with uncounted(LateProgress(), "start"), loading():
         yield
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """Import modules in this block: no collector runs, and Ctrl-C ends the block whatever a module makes of it.
+
+    Extension modules swallow an interruption while they load (torch, while it imports numpy), and what needs the half
+    of a module then fails with any error.
+    """
+    interrupted = False
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal interrupted
+        interrupted = True
+        raise KeyboardInterrupt
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
+        with without_collection():
+            yield
+        return
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        with without_collection():
+            yield
+    except Exception:
+        if not interrupted:
+            raise
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if interrupted:
+        raise KeyboardInterrupt
