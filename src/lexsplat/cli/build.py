@@ -26,9 +26,9 @@ def _is_splats(capture: str) -> bool:
     """Whether a capture is a file with the name of splats."""
     if not Path(capture).is_file():
         return False
-    from lexsplat.scenes.formats.reading import READERS
+    from lexsplat.scenes.formats.reading import is_splats
 
-    return Path(capture).name.lower().endswith(tuple(READERS))
+    return is_splats(Path(capture))
 
 
 @dataclasses.dataclass
