@@ -160,3 +160,11 @@ def test_discard_asks_before_it_deletes_steps(built, tmp_path, monkeypatch, caps
     monkeypatch.setattr("sys.stdin", Terminal("y\n"))
     assert cli.main(discard) == 0
     assert not (copy / "edits.jsonl").exists()
+
+
+def test_an_edited_scene_is_saved_neither_in_a_folder_nor_over_a_file_that_exists(built, tmp_path, capsys):
+    command = ["edit", str(built), "save", "--output"]
+    fails_in_one_line(capsys, [*command, str(tmp_path)], "expected a new folder, found a folder that exists")
+    (tmp_path / "notes.txt").write_text("mine")
+    taken = str(tmp_path / "notes.txt")
+    fails_in_one_line(capsys, [*command, taken], "expected a new folder, found a file that exists")
