@@ -6,6 +6,7 @@ import dataclasses
 import logging
 import sys
 from pathlib import Path
+from shlex import quote
 from typing import ClassVar, Literal
 
 from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
@@ -100,7 +101,7 @@ class Build:
             return
         print(f"{self.output}: finished {', '.join(folder.record['stages'])}")
         if self.until == "language":
-            print(f'next: lexsplat query {self.output} "something you see"')
+            print(f'next: lexsplat query {quote(str(self.output))} "something you see"')
 
     def _warn_of_mixture(self, mixed: bool, what: str) -> None:
         """Warn where a folder becomes a scene and a folder of scenes, as a pattern may match one capture or more."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import tyro
@@ -73,4 +74,4 @@ class Poses:
         if not images.exists() and result.images.resolve() != self.output.resolve():
             with contextlib.suppress(OSError):  # without symbolic links the photos stay where they are
                 images.symlink_to(result.images.resolve(), target_is_directory=True)
-        print(f"next: lexsplat build {self.output} --output SCENE")
+        print(f"next: lexsplat build {quote(str(self.output))} --output SCENE")
