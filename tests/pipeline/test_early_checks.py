@@ -121,6 +121,11 @@ def test_files_that_are_no_splats_are_refused_before_an_encoder_is_loaded(name, 
     refused(None, tmp_path / "out", name, splats=tmp_path / name, kind=FileFormatError)
 
 
+def test_a_video_that_is_missing_is_reported_before_an_encoder_is_loaded(tmp_path, monkeypatch):
+    monkeypatch.setattr("lexsplat.pipeline.build.check_encoders", lambda *_, **__: pytest.fail("too late"))
+    refused(tmp_path / "walk.mp4", tmp_path / "out", "walk.mp4: expected a video, found no such file")
+
+
 def test_splats_of_another_place_are_refused_and_those_of_the_place_taken(tmp_path):
     splats = BUNDLED_SCENE / "gaussians.ply"
     options = {"splats": splats, "until": "reconstruct"}
