@@ -115,6 +115,7 @@ def test_a_lack_of_memory_is_named_with_its_remedy(error, monkeypatch, capsys):
     ("number", "told"),
     [(errno.EACCES, "Permission denied; allow it, or give another place"),
      (errno.ENOSPC, "No space left on device; free some space and run the same command again"),
+     (errno.EEXIST, "File exists; give another place"),
      (errno.EIO, "Input/output error")],
 )  # fmt: skip
 def test_an_error_of_the_system_is_one_line_with_its_remedy(number, told, monkeypatch, capsys):
