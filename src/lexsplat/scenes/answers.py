@@ -214,7 +214,7 @@ def answer_queries(
     """
     names = [scene.view(name).name for name in views] or default_views(scene)
     found = scene.ask(prompts, threshold)
-    thresholds = found.thresholds.tolist()
+    thresholds, folders = found.thresholds.tolist(), file_names(found.prompts)
     answers: list[dict[str, Any]] = [
         {
             "prompt": prompt,
@@ -233,7 +233,9 @@ def answer_queries(
         image = _to_uint8(scene.render(name).image)
         relevancy = scene.relevancy(found.prompts, name).cpu().numpy()
         for answer, limit, values in zip(answers, thresholds, relevancy):
-            answer["views"][name] = _write_images(folder, answer["prompt"], name, image, values, limit)
+            answer["views"][name] = _write_images(
+                folder and folder / folders[answer["prompt"]], name, image, values, limit
+            )
             if values.max() > answer["peak"]:
                 answer["peak"], answer["peak_view"] = float(values.max()), name
     scene.listener(Event("views", len(names), len(names)))
@@ -314,7 +316,7 @@ def default_views(scene: Scene) -> list[str]:
 
 
 def _write_images(
-    folder: Path | None, prompt: str, name: str, image: np.ndarray, relevancy: np.ndarray, threshold: float
+    folder: Path | None, name: str, image: np.ndarray, relevancy: np.ndarray, threshold: float
 ) -> dict[str, Any]:
     mask = relevancy >= threshold
     row, column = np.unravel_index(int(relevancy.argmax()), relevancy.shape)
@@ -327,7 +329,7 @@ def _write_images(
         return answer
     from PIL import Image
 
-    stem = folder / file_name(prompt) / Path(name).with_suffix("")
+    stem = folder / Path(name).with_suffix("")
     heatmap_path = stem.with_name(stem.name + ".png")
     mask_path = stem.with_name(stem.name + ".mask.png")
     for path, pixels in (
@@ -342,6 +344,17 @@ def _write_images(
 def file_name(prompt: str) -> str:
     """A file name for a prompt: its letters and digits, of any alphabet, joined by underscores."""
     return re.sub(r"\W+", "_", prompt.lower()).strip("_")[:80] or "prompt"
+
+
+def file_names(prompts: Sequence[str]) -> dict[str, str]:
+    """File names by prompt; of prompts that differ in other characters alone, the later ones are numbered."""
+    names: dict[str, str] = {}
+    for prompt in dict.fromkeys(prompts):
+        numbered = (
+            f"{file_name(prompt)}{end}" for end in ("", *(f"_{n}" for n in range(2, len(prompts) + 1)))
+        )
+        names[prompt] = next(name for name in numbered if name not in names.values())
+    return names
 
 
 def _to_uint8(image: torch.Tensor) -> np.ndarray:
