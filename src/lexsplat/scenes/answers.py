@@ -16,7 +16,7 @@ from torch import Tensor
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.grammar import understand, undetermined
 from lexsplat.queries.heatmaps import overlay_heatmap
-from lexsplat.queries.kinds import is_kind, is_of_kind
+from lexsplat.queries.kinds import is_kind, is_of_kind, unknown_note
 from lexsplat.queries.parts import FEWEST, part_scores, with_parts
 from lexsplat.queries.relevancy import check_prompts, render_relevancy
 from lexsplat.queries.scoring import form_used
@@ -222,8 +222,7 @@ def answer_queries(
             "peak": 0.0,
             "peak_view": names[0],
             "gaussians": len(found.selection(number)),
-            "present": present,
-            "note": _note_of_grammar(prompt),
+            **_present_and_note(scene, prompt, present),
             "views": {},
         }
         for number, (prompt, limit, present) in enumerate(zip(found.prompts, thresholds, found.presences))
@@ -247,16 +246,21 @@ def answer_queries(
     }
 
 
-def _note_of_grammar(prompt: str) -> str:
-    """What to ask in place of a question or a phrase with grammar, which is asked here in its own words."""
+def _present_and_note(scene: Scene, prompt: str, present: Presence) -> dict[str, str]:
+    """Presence and note of a prompt that is asked in its own words; "unsure" at most for words that are not known.
+
+    The note says what to ask in place of a question or a phrase with grammar.
+    """
+    note = ""
     with contextlib.suppress(QueryError):
         parsed = understand(prompt)
-        understood = parsed.phrase
-        if parsed.unknown:
-            return parsed.note
-        if str(understood).lower() != f'"{singular(undetermined(prompt.strip())).lower()}"':
-            return f"asked in these words; lexsplat find understands {understood}"
-    return ""
+        unknown = unknown_note(parsed.phrase, scene.clip)
+        if parsed.unknown or unknown:
+            note = "; ".join(filter(None, (parsed.note, unknown)))
+            present = "unsure" if present == "yes" else present
+        elif str(parsed.phrase).lower() != f'"{singular(undetermined(prompt.strip())).lower()}"':
+            note = f"asked in these words; lexsplat find understands {parsed.phrase}"
+    return {"present": present, "note": note}
 
 
 def rests_on(scene: Scene) -> str:
