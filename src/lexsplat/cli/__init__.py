@@ -127,6 +127,8 @@ def _run(words: list[str]) -> int:
         _refuse(name)
     from lexsplat.cli.waiting import starting
 
+    if os.environ.get("NO_COLOR"):  # see no-color.org; rich knows it, tyro does not
+        os.environ["PYTHON_TYRO_ANSI_CODES"] = "False"
     entry = COMMANDS[name]
     with starting():
         from lexsplat.cli.arguments import parse
