@@ -185,6 +185,18 @@ def test_no_color_is_heard_and_what_is_no_terminal_gets_none():
     assert "\x1b[" not in refused
 
 
+def test_text_that_the_encoding_of_the_output_lacks_is_named_with_its_remedy(monkeypatch, capsys):
+    def fail(self):
+        "\N{RED APPLE}".encode("latin-1")
+
+    monkeypatch.setattr("lexsplat.cli.info.Info.run", fail)
+    assert cli.main(["info", "demo"]) == 1
+    told = (
+        "\\U0001f34e': expected characters of the encoding latin-1, found others; set PYTHONIOENCODING=utf-8"
+    )
+    assert capsys.readouterr().err == f"error: {told}\n"
+
+
 def test_version_is_printed(capsys):
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("lexsplat 0.")

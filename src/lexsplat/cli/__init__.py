@@ -103,6 +103,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UnicodeEncodeError as error:
         # File names may hold any bytes; camera files, JSON and reports hold text.
         subject = ascii(str(error.object))[1:100]
+        if error.encoding.replace("_", "-") != "utf-8":
+            expected = f"characters of the encoding {error.encoding}"
+            told = f"expected {expected}, found others; set PYTHONIOENCODING=utf-8"
+            print(f"error: {subject}: {told}", file=sys.stderr)
+            return 1
         remedy = "rename the file or folder"
         print(f"error: {subject}: expected names in UTF-8, found other bytes; {remedy}", file=sys.stderr)
     except OSError as error:  # such as a full disk or a folder without permission
