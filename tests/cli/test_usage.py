@@ -197,6 +197,12 @@ def test_text_that_the_encoding_of_the_output_lacks_is_named_with_its_remedy(mon
     assert capsys.readouterr().err == f"error: {told}\n"
 
 
+def test_a_command_runs_without_standard_output(monkeypatch):
+    monkeypatch.setattr("sys.stdout", None)
+    monkeypatch.setattr("lexsplat.cli.waiting.LateProgress.__init__.__defaults__", (0.0,))
+    assert cli.main(["info", "demo"]) == 0
+
+
 def test_version_is_printed(capsys):
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("lexsplat 0.")

@@ -77,7 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         status = _run(words)
-        sys.stdout.flush()  # here, so that a reader that has ended is noticed below
+        if sys.stdout is not None:  # None if it is closed, as in `lexsplat info SCENE >&-`
+            sys.stdout.flush()  # here, so that a reader that has ended is noticed below
         return status
     except LexsplatError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)

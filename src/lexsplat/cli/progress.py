@@ -65,7 +65,8 @@ class ProgressBars:
             TimeRemainingColumn(),
             TextColumn("[dim]{task.fields[metrics]}"),
             console=self.console,
-            redirect_stdout=sys.stdout.isatty(),  # what is piped is data and stays on standard output
+            # What is piped is data and stays on standard output, which is None if it is closed.
+            redirect_stdout=sys.stdout is not None and sys.stdout.isatty(),
             disable=not self.console.is_terminal,
         )
 
