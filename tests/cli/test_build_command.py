@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 
 import pytest
@@ -39,6 +40,18 @@ def test_building_again_changes_no_result(built, tiny_capture):
     after = modified(built)
     changed = {name for name in before if after[name] != before[name]}
     assert changed <= {"scene.json", "cameras.json", ".lock"}
+
+
+def test_the_commands_that_are_proposed_name_a_path_with_spaces_as_one_word(
+    built, tiny_capture, tmp_path, capsys
+):
+    scene, page = str(tmp_path / "my scene"), str(tmp_path / "my page")
+    shutil.copytree(built, scene)
+    assert cli.main(["build", str(tiny_capture), "--output", scene, *QUICK]) == 0
+    proposed = capsys.readouterr().out.splitlines()[-1]
+    assert shlex.split(proposed) == ["next:", "lexsplat", "query", scene, "something you see"]
+    assert cli.main(["publish", scene, page, "--words-only"]) == 0
+    assert shlex.split(capsys.readouterr().out.splitlines()[-1])[-1] == page
 
 
 def test_a_changed_setting_reruns_only_the_stages_that_depend_on_it(built, tiny_capture, tmp_path):

@@ -91,10 +91,17 @@ def test_the_journal_holds_the_motions_of_the_command_line(built, tmp_path, caps
         (["duplicate", "--select", "red apple"], "duplicate needs --by, --turn or --scale"),
         (["move", "--select", "red apple", "--scale", "-1"], "scale must be positive"),
         (["move", "--select", "red apple", "--by", "nan", "0", "0"], "finite"),
-        (["recolor", "--select", "red apple", "--color", "2", "0", "0"], "in 0..1"),
-        (["recolor", "--select", "red apple", "--color", "1", "0", "0", "--strength", "3"], "in 0..1"),
+        (["recolor", "--select", "red apple", "--color", "2", "0", "0"], "in 0..1, got 2 0 0"),
+        (["recolor", "--select", "red apple", "--color", "1", "0", "0", "--strength", "3"], "in 0..1, got 3"),
         (["delete", "--select", "red apple", "--threshold", "3"], "in 0..1"),
         (["delete", "--select", "red apple", "--grow", "-1"], "not be negative"),
+        (["undo", "--select", "red apple"], "undo takes no --select"),
+        (["list", "--output", "list.txt"], "list takes no --output"),
+        (["keep", "--select", "red apple", "--no-fill"], "keep takes no --no-fill"),
+        (
+            ["recolor", "--select", "red apple", "--color", "red", "--by", "1", "0", "0"],
+            "recolor takes no --by",
+        ),
     ],
 )
 def test_invalid_edits_are_wrong_usage(built, arguments, words, capsys):
@@ -153,3 +160,11 @@ def test_discard_asks_before_it_deletes_steps(built, tmp_path, monkeypatch, caps
     monkeypatch.setattr("sys.stdin", Terminal("y\n"))
     assert cli.main(discard) == 0
     assert not (copy / "edits.jsonl").exists()
+
+
+def test_an_edited_scene_is_saved_neither_in_a_folder_nor_over_a_file_that_exists(built, tmp_path, capsys):
+    command = ["edit", str(built), "save", "--output"]
+    fails_in_one_line(capsys, [*command, str(tmp_path)], "expected a new folder, found a folder that exists")
+    (tmp_path / "notes.txt").write_text("mine")
+    taken = str(tmp_path / "notes.txt")
+    fails_in_one_line(capsys, [*command, taken], "expected a new folder, found a file that exists")

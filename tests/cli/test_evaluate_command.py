@@ -64,6 +64,15 @@ def test_given_ground_truth_of_training_views_only_is_refused(built, tiny_captur
     )
 
 
+def test_a_scene_without_held_out_views_says_that_nothing_is_measured(built, tmp_path, caplog):
+    shutil.copytree(built, tmp_path / "scene")
+    cameras = tmp_path / "scene" / "cameras.json"
+    cameras.write_text(cameras.read_text().replace('"test"', '"train"'))
+    assert cli.main(["evaluate", str(tmp_path / "scene")]) == 0
+    assert "no held-out views" in caplog.text
+    assert "build it with --test-every or --test-views" in caplog.text
+
+
 def without_times(result: dict) -> dict:
     """``metrics.json`` without times and memory."""
     size = {key: value for key, value in result["size"].items() if not key.startswith("peak_")}

@@ -40,3 +40,20 @@ def test_an_export_asks_before_it_replaces_a_file(built, tmp_path, monkeypatch, 
     monkeypatch.setattr("sys.stdin", Terminal("n\n"))
     assert cli.main([*command, "--force"]) == 0
     assert file.read_bytes() == (built / "gaussians.ply").read_bytes()
+
+
+@pytest.mark.parametrize("option", [("--threshold", "0.3"), ("--view", "view_06")])
+def test_an_option_about_phrases_without_phrases_is_refused(built, tmp_path, capsys, option):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["export", str(built), str(tmp_path / "a.ply"), *option])
+    assert ended.value.code == 2
+    assert "--view and --threshold need --select PHRASE" in capsys.readouterr().err
+
+
+def test_an_export_in_a_folder_with_a_scene_named_demo_says_once_which_one_it_is(
+    built, tmp_path, monkeypatch, capsys
+):
+    shutil.copytree(built, tmp_path / "demo")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["export", "demo", "ball.ply", "--select", "blue ball", "--threshold", "0.05"]) == 0
+    assert capsys.readouterr().err.count("not what is bundled") == 1

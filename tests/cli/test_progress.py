@@ -123,8 +123,8 @@ def test_the_rate_of_a_stage_leaves_out_the_time_since_an_earlier_scene_was_kept
 
 
 def test_work_that_cannot_be_counted_states_the_time_so_far(clock, monkeypatch, capsys):
-    with ProgressBars({"export": 98.0}) as bars:  # it began two seconds ago
-        bars(Event("export", 0, 1))
+    with ProgressBars() as bars:
+        bars.add(Event("export", 0, 1), 98.0)  # it began two seconds ago
         clock[0] += 5
         bars(Event("export", 1, 1))
         bars(Event("views", 1, 1))
@@ -134,8 +134,8 @@ def test_work_that_cannot_be_counted_states_the_time_so_far(clock, monkeypatch, 
     monkeypatch.setattr(
         progress, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120, _environ={})
     )
-    with ProgressBars({"export": 98.0}) as bars:
-        bars(Event("export", 0, 1))
+    with ProgressBars() as bars:
+        bars.add(Event("export", 0, 1), 98.0)
         assert bars._progress.tasks[0].total is None
         assert bars._progress.tasks[0].start_time == 98.0
         bars(Event("export", 1, 1))

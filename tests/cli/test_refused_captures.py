@@ -120,3 +120,10 @@ def test_a_downscale_that_is_too_large_is_refused_before_training(tiny_capture, 
 def test_file_names_outside_utf8_end_in_one_line(tmp_path, capsys):
     capture = write_capture(tmp_path / "capture\udcff", views=4, width=32, height=24)
     fails_in_one_line(capsys, ["build", str(capture), "--output", str(tmp_path / "out"), *QUICK], "UTF-8")
+
+
+@pytest.mark.parametrize("name", ["nowhere", "walk.mp4", "empty"])
+def test_poses_of_nothing_end_in_one_line_without_output(name, tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    fails_in_one_line(capsys, ["poses", str(tmp_path / name), "--output", str(tmp_path / "out")], name)
+    assert not (tmp_path / "out").exists()

@@ -1,5 +1,6 @@
 """Help pages, wrong usage, Ctrl-C and closed pipes of the command line."""
 
+import contextlib
 import errno
 import os
 import re
@@ -115,6 +116,7 @@ def test_a_lack_of_memory_is_named_with_its_remedy(error, monkeypatch, capsys):
     ("number", "told"),
     [(errno.EACCES, "Permission denied; allow it, or give another place"),
      (errno.ENOSPC, "No space left on device; free some space and run the same command again"),
+     (errno.EEXIST, "File exists; give another place"),
      (errno.EIO, "Input/output error")],
 )  # fmt: skip
 def test_an_error_of_the_system_is_one_line_with_its_remedy(number, told, monkeypatch, capsys):
@@ -153,6 +155,52 @@ sys.exit(main())
         [sys.executable, "-c", interrupting], capture_output=True, text=True, timeout=120, check=False
     )
     assert (done.returncode, done.stderr) == (130, STOPPED)
+
+
+def output_in_a_terminal(*words: str, **environment: str) -> tuple[str, str]:
+    """What a command prints on standard output, a terminal, and on standard error, a pipe."""
+    pty = pytest.importorskip("pty", reason="Windows has none")
+    ours, theirs = pty.openpty()
+    done = subprocess.run(
+        [sys.executable, "-m", "lexsplat", *words], stdout=theirs, stderr=subprocess.PIPE, text=True, check=False,
+        timeout=120, env={**os.environ, "TERM": "xterm", **environment},
+    )  # fmt: skip
+    os.close(theirs)
+    said = b""
+    with contextlib.suppress(OSError):  # the end of a closed terminal
+        while part := os.read(ours, 4096):
+            said += part
+    os.close(ours)
+    return said.decode(), done.stderr
+
+
+@pytest.mark.slow
+def test_no_color_is_heard_and_what_is_no_terminal_gets_none():
+    assert "\x1b[" in output_in_a_terminal("info", "--help", NO_COLOR="")[0]
+    page = output_in_a_terminal("info", "--help", NO_COLOR="1")[0]
+    assert "--json" in page
+    assert "\x1b[" not in page
+    refused = output_in_a_terminal("find", "demo", "mug", "--threshold", "x")[1]
+    assert "expected a number, found 'x'" in refused
+    assert "\x1b[" not in refused
+
+
+def test_text_that_the_encoding_of_the_output_lacks_is_named_with_its_remedy(monkeypatch, capsys):
+    def fail(self):
+        "\N{RED APPLE}".encode("latin-1")
+
+    monkeypatch.setattr("lexsplat.cli.info.Info.run", fail)
+    assert cli.main(["info", "demo"]) == 1
+    told = (
+        "\\U0001f34e': expected characters of the encoding latin-1, found others; set PYTHONIOENCODING=utf-8"
+    )
+    assert capsys.readouterr().err == f"error: {told}\n"
+
+
+def test_a_command_runs_without_standard_output(monkeypatch):
+    monkeypatch.setattr("sys.stdout", None)
+    monkeypatch.setattr("lexsplat.cli.waiting.LateProgress.__init__.__defaults__", (0.0,))
+    assert cli.main(["info", "demo"]) == 0
 
 
 def test_version_is_printed(capsys):

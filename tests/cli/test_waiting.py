@@ -1,6 +1,10 @@
 """Progress of commands that are mostly quick."""
 
+import signal
 import time
+from contextlib import suppress
+
+import pytest
 
 from lexsplat.cli import waiting
 from lexsplat.cli.waiting import LateProgress
@@ -53,6 +57,42 @@ def test_a_quick_stage_within_a_slow_one_does_not_end_its_progress(capsys, monke
     listener(Event("page", 6, 6))
 
 
+def test_quick_stages_within_a_slow_one_are_not_shown_and_slow_ones_are(capsys, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    listener = LateProgress()
+    listener(Event("page", 0, 6))
+    now[0] += 3.0
+    listener(Event("page", 1, 6))
+    for _ in range(20):  # each of one word
+        listener(Event("words", 0, 1))
+        listener(Event("words", 1, 1))
+    said = capsys.readouterr().err
+    assert "page: 1/6" in said
+    assert "words" not in said
+    listener(Event("words", 0, 2))
+    now[0] += 5.0
+    listener(Event("words", 1, 2))
+    listener(Event("words", 2, 2))
+    assert "words: 2/2" in capsys.readouterr().err
+    listener(Event("page", 6, 6))
+
+
+def test_a_silent_stage_within_a_slow_one_is_shown_after_the_time(capsys):
+    listener = LateProgress(patience=0.05)
+    listener(Event("page", 0, 6))
+    said = ""
+    for stage in ("page", "export"):
+        listener(Event("export", 0, 1))
+        deadline = time.monotonic() + 20
+        while f"{stage}: 0" not in said and time.monotonic() < deadline:
+            time.sleep(0.02)
+            said += capsys.readouterr().err
+        assert f"{stage}: 0" in said
+    listener(Event("export", 1, 1))
+    listener(Event("page", 6, 6))
+
+
 def test_a_stage_that_failed_does_not_show_its_next_run_too_early(capsys, monkeypatch):
     now = [100.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
@@ -77,3 +117,35 @@ def test_imports_that_take_long_are_shown_with_the_time_so_far_and_quick_ones_ar
             time.sleep(0.02)
     assert "so far" in said
     assert "start: took 0:0" in capsys.readouterr().err
+
+
+@pytest.fixture
+def ctrl_c():
+    """Ctrl-C as in a terminal: a job in the background starts with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield lambda: signal.raise_signal(signal.SIGINT)
+    signal.signal(signal.SIGINT, before)
+
+
+def swallow(ctrl_c):
+    """What torch makes of it while it imports numpy."""
+    with suppress(KeyboardInterrupt):
+        ctrl_c()
+
+
+def fail_after(ctrl_c):
+    swallow(ctrl_c)
+    raise ImportError("cannot load module more than once per process")
+
+
+@pytest.mark.parametrize("module", [swallow, fail_after])
+def test_ctrl_c_ends_the_loading_whatever_a_module_makes_of_it(module, ctrl_c):
+    with pytest.raises(KeyboardInterrupt), waiting.loading():
+        module(ctrl_c)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_error_of_loading_without_ctrl_c_stays(ctrl_c):
+    with pytest.raises(ImportError, match="no module"), waiting.loading():
+        raise ImportError("no module named torch")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from lexsplat import cli
+
 
 def run(*arguments):
     command = [sys.executable, "-m", "lexsplat", "mcp", "demo", *arguments]
@@ -33,3 +35,14 @@ def test_a_taken_port_and_a_foreign_address_end_in_one_line():
     assert foreign.returncode == 1
     assert len(foreign.stderr.splitlines()) == 1
     assert "host.invalid" in foreign.stderr
+
+
+def test_a_server_over_http_states_its_address(monkeypatch, capsys):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    monkeypatch.setattr("lexsplat.mcp.server.serve_http", lambda *_: None)
+    assert cli.main(["mcp", "demo", "--http", "--port", str(port)]) == 0
+    assert (
+        capsys.readouterr().out == f"demo served at http://127.0.0.1:{port}/mcp (Ctrl-C stops the server)\n"
+    )

@@ -22,7 +22,7 @@ from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.encoding import check_encoders
 from lexsplat.reconstruction import ReconstructionConfig
-from lexsplat.runtime.errors import BackendError, CaptureError, LexsplatError, ModelError
+from lexsplat.runtime.errors import BackendError, CaptureError, FileFormatError, LexsplatError, ModelError
 from lexsplat.runtime.progress import NOTE
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 
@@ -41,7 +41,9 @@ def photos(tmp_path, monkeypatch) -> Path:
     return folder
 
 
-def refused(source: Path, output: Path, *parts: str, kind=CaptureError, config=CONFIG, **options) -> None:
+def refused(
+    source: Path | None, output: Path, *parts: str, kind=CaptureError, config=CONFIG, **options
+) -> None:
     with pytest.raises(kind) as caught:
         build(source, output / "new" / "scene", config, **options)
     assert isinstance(caught.value, LexsplatError)
@@ -110,6 +112,18 @@ def test_masks_are_checked_before_features_are_searched(tmp_path):
 
 def test_splats_need_cameras(photos, tmp_path):
     refused(photos, tmp_path / "out", "without cameras", splats=BUNDLED_SCENE / "gaussians.ply")
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "splats.pt"])
+def test_files_that_are_no_splats_are_refused_before_an_encoder_is_loaded(name, tmp_path, monkeypatch):
+    monkeypatch.setattr("lexsplat.pipeline.build.check_encoders", lambda *_, **__: pytest.fail("too late"))
+    (tmp_path / name).write_bytes(b"no splats")
+    refused(None, tmp_path / "out", name, splats=tmp_path / name, kind=FileFormatError)
+
+
+def test_a_video_that_is_missing_is_reported_before_an_encoder_is_loaded(tmp_path, monkeypatch):
+    monkeypatch.setattr("lexsplat.pipeline.build.check_encoders", lambda *_, **__: pytest.fail("too late"))
+    refused(tmp_path / "walk.mp4", tmp_path / "out", "walk.mp4: expected a video, found no such file")
 
 
 def test_splats_of_another_place_are_refused_and_those_of_the_place_taken(tmp_path):

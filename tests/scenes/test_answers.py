@@ -1,5 +1,7 @@
 """Answers as data: which instances an answer keeps, and what a query says about its views."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -53,6 +55,15 @@ def test_a_query_without_a_folder_has_the_same_numbers_and_no_images(scene, tmp_
     for left, right in zip(plain["prompts"], drawn["prompts"]):
         for view, entry in right["views"].items():
             assert left["views"][view] == {k: v for k, v in entry.items() if k not in ("heatmap", "mask")}
+
+
+def test_prompts_that_differ_in_other_characters_alone_do_not_overwrite_the_images_of_each_other(
+    scene, tmp_path
+):
+    prompts = ["ball 0", "ball/0", "ball 0", "Ball 0?"]
+    answers = answer_queries(scene, prompts, ["view0"], 0.4, tmp_path)["prompts"]
+    masks = [answer["views"][answer["peak_view"]]["mask"] for answer in answers]
+    assert [Path(mask).parent.name for mask in masks] == ["ball_0", "ball_0_2", "ball_0", "ball_0_3"]
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,8 @@ def test_a_journal_replays_a_fill_and_its_undo(tmp_path):
     again = Editor(scene, tmp_path / "edits.jsonl")
     for name, tensor in editor.scene.gaussians.tensors().items():
         assert torch.equal(again.scene.gaussians.tensors()[name], tensor), name
+    added = len(again.scene.gaussians) - len(scene.gaussians) + int(again.steps[0].mask.sum())
+    assert str(again.steps[0]).endswith(f" Gaussians, filled with {added})")
     assert again.undo()
     assert torch.equal(again.scene.gaussians.means, scene.gaussians.means)
 

@@ -41,6 +41,13 @@ def test_the_error_for_a_folder_without_a_scene_names_the_build_command(tmp_path
         SceneFolder.open(tmp_path / "nowhere")
 
 
+def test_the_error_for_splats_names_the_command_that_makes_a_scene_of_them(tmp_path):
+    splats = tmp_path / "my room.ply"
+    splats.write_bytes(b"ply\n")
+    with pytest.raises(SceneFolderError, match=r"lexsplat language --splats '.*my room.ply' --output SCENE"):
+        SceneFolder.open(splats)
+
+
 def test_another_format_version_is_refused(tmp_path):
     (tmp_path / "scene.json").write_text(json.dumps({"format_version": 99, "stages": {}}))
     with pytest.raises(SceneFolderError, match="format_version 1, found 99"):

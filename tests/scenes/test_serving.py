@@ -169,6 +169,13 @@ def test_a_query_that_is_not_understood_is_reported(served_demo):
     assert answer["note"] == 'not understood ("first"): asked for as one thing, in these words'
 
 
+def test_a_query_of_words_that_the_encoder_does_not_know_is_unsure_at_most_as_in_find(served_demo):
+    prompts = ["xxxxxxx", "mug"]
+    unknown, mug = answer_queries(served_demo.scene, prompts, ["view_033"], None, None)["prompts"]
+    assert unknown["note"] == 'the bundled encoder knows English words alone, not "xxxxxxx"'
+    assert (unknown["present"], mug["present"], mug["note"]) == ("unsure", "yes", "")
+
+
 @pytest.mark.parametrize(
     ("phrase", "understood", "names"),
     [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 
 from lexsplat.captures.capture import Capture, View, stem_of
 from lexsplat.captures.ground_truth.layouts import annotated_names, find_annotations
@@ -144,7 +145,7 @@ def _read_camera_files(path: Path, images: Path | None) -> CameraFiles:
             path,
             expected="cameras (a COLMAP model in sparse/0, or transforms.json)",
             found=f"{len(photos)} photos without cameras",
-            remedy=f"run: lexsplat poses {path}",
+            remedy=f"run: lexsplat poses {quote(str(path))}",
         )
     raise CaptureError(
         path,

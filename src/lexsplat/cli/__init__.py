@@ -57,6 +57,7 @@ COMMANDS = {
 
 _REMEDIES = {
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "; allow it, or give another place"),
+    **dict.fromkeys((errno.EEXIST, errno.ENOTDIR), "; give another place"),
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "; free some space and run the same command again"),
 }
 """What to do about errors of the system, by their numbers."""
@@ -76,7 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         status = _run(words)
-        sys.stdout.flush()  # here, so that a reader that has ended is noticed below
+        if sys.stdout is not None:  # None if it is closed, as in `lexsplat info SCENE >&-`
+            sys.stdout.flush()  # here, so that a reader that has ended is noticed below
         return status
     except LexsplatError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
@@ -102,6 +104,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UnicodeEncodeError as error:
         # File names may hold any bytes; camera files, JSON and reports hold text.
         subject = ascii(str(error.object))[1:100]
+        if error.encoding.replace("_", "-") != "utf-8":
+            expected = f"characters of the encoding {error.encoding}"
+            told = f"expected {expected}, found others; set PYTHONIOENCODING=utf-8"
+            print(f"error: {subject}: {told}", file=sys.stderr)
+            return 1
         remedy = "rename the file or folder"
         print(f"error: {subject}: expected names in UTF-8, found other bytes; {remedy}", file=sys.stderr)
     except OSError as error:  # such as a full disk or a folder without permission
@@ -126,6 +133,8 @@ def _run(words: list[str]) -> int:
         _refuse(name)
     from lexsplat.cli.waiting import starting
 
+    if os.environ.get("NO_COLOR"):  # see no-color.org; rich knows it, tyro does not
+        os.environ["PYTHON_TYRO_ANSI_CODES"] = "False"
     entry = COMMANDS[name]
     with starting():
         from lexsplat.cli.arguments import parse

@@ -115,6 +115,8 @@ def _parsed(command: type[CommandT], program: str, words: Sequence[str]) -> Comm
         all_options = f"All options: {program} {whole}"
         text = re.sub(page, lambda found: all_options.ljust(len(found.group())), written.getvalue())
         text = re.sub(nothing, lambda found: re.sub(r"[^\s│]", " ", found.group()), text)
+        if not sys.stderr.isatty():  # tyro asks standard output
+            text = re.sub(r"\x1b\[[\d;]*m", "", text)
         print(text, end="", file=sys.stderr)
 
 

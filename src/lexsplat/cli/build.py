@@ -6,6 +6,7 @@ import dataclasses
 import logging
 import sys
 from pathlib import Path
+from shlex import quote
 from typing import ClassVar, Literal
 
 from lexsplat.cli.arguments import ESSENTIAL_SETTINGS
@@ -26,9 +27,9 @@ def _is_splats(capture: str) -> bool:
     """Whether a capture is a file with the name of splats."""
     if not Path(capture).is_file():
         return False
-    from lexsplat.scenes.formats.reading import READERS
+    from lexsplat.scenes.formats.reading import is_splats
 
-    return Path(capture).name.lower().endswith(tuple(READERS))
+    return is_splats(Path(capture))
 
 
 @dataclasses.dataclass
@@ -100,7 +101,7 @@ class Build:
             return
         print(f"{self.output}: finished {', '.join(folder.record['stages'])}")
         if self.until == "language":
-            print(f'next: lexsplat query {self.output} "something you see"')
+            print(f'next: lexsplat query {quote(str(self.output))} "something you see"')
 
     def _warn_of_mixture(self, mixed: bool, what: str) -> None:
         """Warn where a folder becomes a scene and a folder of scenes, as a pattern may match one capture or more."""

@@ -21,6 +21,18 @@ if TYPE_CHECKING:
 
 CHANGES = ("delete", "keep", "recolor", "move", "duplicate")
 ACTIONS = (*CHANGES, "undo", "redo", "list", "discard", "save")
+_CHOICE = ("select", "view", "threshold", "grow", "shrink", "largest")
+"""Options that say what to change."""
+_MOTION = ("by", "turn", "scale")
+_OPTIONS = {
+    "delete": ("fill",),
+    "recolor": ("color", "strength"),
+    "move": _MOTION,
+    "duplicate": _MOTION,
+    "save": ("output",),
+    "discard": ("yes",),
+}
+"""Options of single actions."""
 Action = tyro.conf.Positional[
     Annotated[
         str,
@@ -102,15 +114,26 @@ class Edit:
         if self.action in ("move", "duplicate") and not any((*self.by, self.turn, self.scale - 1)):
             raise ValueError(f"{self.action} needs --by, --turn or --scale")
         check_threshold(self.threshold)
+        self._check_meaning()
         self._check_numbers()
+
+    def _check_meaning(self) -> None:
+        used = {"scene", "action", "clip", "device", *_OPTIONS.get(self.action, ())}
+        used.update(_CHOICE if self.action in CHANGES else ())
+        for option in dataclasses.fields(self):
+            if option.name not in used and getattr(self, option.name) != option.default:
+                negation = "no-" if option.default is True else ""
+                raise ValueError(f"{self.action} takes no --{negation}{option.name}")
 
     def _check_numbers(self) -> None:
         if not all(map(math.isfinite, (*self.by, self.turn, self.scale))):
             raise ValueError("--by, --turn and --scale must be finite")
         if self.scale <= 0:
             raise ValueError(f"scale must be positive, got {self.scale:g}")
-        if not all(0 <= value <= 1 for value in (*(self.color or ()), self.strength)):
-            raise ValueError("--color needs three numbers in 0..1, and --strength one in 0..1")
+        for name, values in (("color", self.color or ()), ("strength", (self.strength,))):
+            if not all(0 <= value <= 1 for value in values):
+                found = " ".join(f"{value:g}" for value in values)
+                raise ValueError(f"--{name} must be in 0..1, got {found}")
         for name, value in (("grow", self.grow), ("shrink", self.shrink)):
             if value is not None and not 0 <= value < math.inf:
                 raise ValueError(f"--{name} must not be negative or infinite, got {value:g}")

@@ -54,6 +54,8 @@ class Export:
     def check(self) -> None:
         """Refuse invalid options."""
         check_threshold(self.threshold)
+        if not self.select and (self.view is not None or self.threshold is not None):
+            raise ValueError("--view and --threshold need --select PHRASE")
 
     def run(self) -> None:
         """Write the file."""
@@ -67,7 +69,8 @@ class Export:
         if not self.force:
             _refuse_existing(self.file)
         if self.select or self.language:
-            scene = open_scene(str(folder.root), self.device, self.clip)
+            # As a full path, so that the note of `open_folder` is not printed again.
+            scene = open_scene(str(folder.root.resolve()), self.device, self.clip)
             found = [
                 dataclasses.replace(scene.find(phrase, self.view, threshold=self.threshold), phrase=phrase)
                 for phrase in self.select

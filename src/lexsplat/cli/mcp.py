@@ -98,4 +98,7 @@ class Mcp:
         if listening is None:
             server.run()
         else:
+            host = f"[{self.host}]" if ":" in self.host else self.host
+            address = f"http://{host}:{listening.getsockname()[1]}/mcp"
+            print(f"{', '.join(self.scenes)} served at {address} (Ctrl-C stops the server)", flush=True)
             serve_http(server, listening, self.host, self.token)

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from lexsplat.cli.waiting import LateProgress, starting
-from lexsplat.runtime.lazy import without_collection
+from lexsplat.cli.waiting import LateProgress, loading, starting
 from lexsplat.runtime.progress import uncounted
 
 if TYPE_CHECKING:
@@ -54,7 +53,7 @@ def open_scene(path: str, device: str, clip: str | None) -> Scene:
     """Open the scene of a command with its encoders."""
     note_hidden_demo(path)
     listener = LateProgress()
-    with uncounted(listener, "scene"), without_collection():
+    with uncounted(listener, "scene"), loading():
         from lexsplat.scenes import scene as search
 
         scene = search.open_scene(path, device=device, clip=clip)

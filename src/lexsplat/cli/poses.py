@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import tyro
@@ -54,11 +55,16 @@ class Poses:
     def run(self) -> None:
         """Write the model and state how many photos are registered, and which are not."""
         from lexsplat.captures import poses_from_photos
-        from lexsplat.captures.readers.video import is_video, sample_video
+        from lexsplat.captures.readers.video import is_video, require_video, sample_video
+        from lexsplat.captures.sfm.preparation import checked_photos, photo_folder
         from lexsplat.cli.progress import ProgressBars
         from lexsplat.scenes.folder import SceneFolder
 
         photos, memory = self.photos, parse_bytes(self.memory)
+        if is_video(photos):  # before --output is made
+            require_video(photos)
+        else:
+            checked_photos(photo_folder(photos), self.output)
         with SceneFolder(self.output).locked(), ProgressBars() as bars:
             if is_video(photos):
                 photos = self.output / "images"
@@ -73,4 +79,4 @@ class Poses:
         if not images.exists() and result.images.resolve() != self.output.resolve():
             with contextlib.suppress(OSError):  # without symbolic links the photos stay where they are
                 images.symlink_to(result.images.resolve(), target_is_directory=True)
-        print(f"next: lexsplat build {self.output} --output SCENE")
+        print(f"next: lexsplat build {quote(str(self.output))} --output SCENE")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from types import TracebackType
 
@@ -48,14 +48,11 @@ class ProgressBars:
     """A listener (see `lexsplat.runtime.progress`) that shows stages with rate and time left on standard error.
 
     Use it as a context manager, and call the instance with events.
-
-    Args:
-        began: When stages began that are under way, by the monotonic clock.
     """
 
-    def __init__(self, began: Mapping[str, float] | None = None) -> None:
+    def __init__(self) -> None:
         self.console = Console(stderr=True)
-        self._began = dict(began or {})
+        self._began: dict[str, float] = {}
         self._tasks: dict[str, TaskID] = {}
         self._pace = Pace()
         self._last_line: dict[str, float] = {}
@@ -68,7 +65,8 @@ class ProgressBars:
             TimeRemainingColumn(),
             TextColumn("[dim]{task.fields[metrics]}"),
             console=self.console,
-            redirect_stdout=sys.stdout.isatty(),  # what is piped is data and stays on standard output
+            # What is piped is data and stays on standard output, which is None if it is closed.
+            redirect_stdout=sys.stdout is not None and sys.stdout.isatty(),
             disable=not self.console.is_terminal,
         )
 
@@ -80,6 +78,11 @@ class ProgressBars:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._progress.stop()
+
+    def add(self, event: Event, began: float) -> None:
+        """Show the first event of a stage that began earlier, at a time of the monotonic clock."""
+        self._began[event.stage] = began
+        self(event)
 
     def __call__(self, event: Event) -> None:
         """Show one event."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, ClassVar
 
 import tyro
@@ -78,4 +79,4 @@ class Publish:
             f"{written.phrases:,} phrases and {free}"
         )
         if not self.single_file:
-            print(f"open it with: python -m http.server --directory {written.path}")
+            print(f"open it with: python -m http.server --directory {quote(str(written.path))}")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,12 @@ from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path, read_json, write_json
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.answers import file_name
+from lexsplat.scenes.facts import is_of_chosen_views
 from lexsplat.scenes.feature_maps import code_colors, feature_picture
 from lexsplat.scenes.previous import require_current
 from lexsplat.scenes.scene import Scene
+
+log = logging.getLogger("lexsplat")
 
 
 def evaluate_scene(
@@ -62,6 +66,10 @@ def evaluate_scene(
     require_current(folder)
     folder.refuse_bundled()
     photos = reload_capture(folder, capture)
+    if not photos.test_names:
+        log.warning(
+            "%s: no held-out views: neither images nor language are measured; %s", folder.root, _way(record)
+        )
     source = GroundTruthSource(masks, prompt_list)
     found = load_annotations(photos) if source == GroundTruthSource() else read_held_out(photos, source)
     gallery = Gallery()
@@ -99,6 +107,13 @@ def evaluate_scene(
             temporary.write_bytes(images["heatmap"])
     listener(Event("report", len(gallery.views), len(gallery.views)))
     return result
+
+
+def _way(record: Mapping[str, Any]) -> str:
+    """How a scene gets held-out views."""
+    if is_of_chosen_views(record):
+        return "views of splats are no ground truth, so give lexsplat language the photos, too"
+    return "build it with --test-every or --test-views"
 
 
 def _prompt_kinds(root: Path) -> dict[str, str]:

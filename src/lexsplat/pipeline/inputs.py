@@ -26,7 +26,7 @@ from lexsplat.captures import (
 )
 from lexsplat.captures.ground_truth.layouts import annotated_names, find_annotations
 from lexsplat.captures.loading import check_capture
-from lexsplat.captures.readers.video import is_video, sample_video
+from lexsplat.captures.readers.video import is_video, require_video, sample_video
 from lexsplat.captures.sfm.preparation import (
     checked_photos,
     find_photos,
@@ -153,8 +153,8 @@ def survey_photos(
     Masks are checked by structure from motion before it searches features.
 
     Raises:
-        CaptureError: As `preview_capture`, if there is neither a camera nor a photo, or if ground truth belongs to no
-            photo or does not fit it.
+        CaptureError: As `preview_capture`, if there is neither a camera, a photo nor a video, or if ground truth
+            belongs to no photo or does not fit it.
         FileFormatError: If features of another program or 2D segments do not fit the photos.
         ModelError: If 2D segments come from nothing known.
     """
@@ -163,6 +163,7 @@ def survey_photos(
         return None
     capture = preview_capture(source, output, config, test_names)
     if capture is None:
+        require_video(source)
         return PhotoSurvey(config.frames, _VIDEO_SIZE)
     load_annotations(capture)
     check_given_maps(config, capture)

@@ -13,9 +13,10 @@ from lexsplat.captures import View
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import CaptureError, FileFormatError
+from lexsplat.runtime.files import refuse_pickle
 from lexsplat.runtime.fingerprints import file_hash, fingerprint
 from lexsplat.runtime.sampling import evenly
-from lexsplat.scenes.formats.reading import splat_file
+from lexsplat.scenes.formats.reading import reader_of, splat_file
 from lexsplat.scenes.formats.sog import META
 from lexsplat.scenes.formats.sog_streamed import LOD_META
 
@@ -33,13 +34,16 @@ def existing_splats(path: Path | None) -> Path:
     """The path, if it is a file, or the file that names the parts of a SOG in a folder.
 
     Raises:
-        FileFormatError: If there is no such file.
+        FileFormatError: If there is no such file, or its ending is that of no format that is read.
     """
     if path is None or not splat_file(path).is_file():
         is_folder = path is not None and path.is_dir()
         found = f"a folder without {META} and {LOD_META}" if is_folder else "no such file"
         raise FileFormatError(path, expected="a file of Gaussians", found=found, remedy="check the path")
-    return splat_file(path)
+    file = splat_file(path)
+    refuse_pickle(file)
+    reader_of(file)
+    return file
 
 
 def splats_hash(path: Path | None) -> str:

@@ -7,6 +7,8 @@ names are among its members. Only everyday kinds with everyday members are here;
 
 from __future__ import annotations
 
+from lexsplat.queries.phrases import Phrase, things_of
+from lexsplat.queries.spelling import strange
 from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary, words
 
 _MEMBERS = {
@@ -24,6 +26,8 @@ _SAME = {
 KINDS = {kind: frozenset(words(members)) for kind, members in _MEMBERS.items()}
 KIND_PHRASES = (*_MEMBERS, *_SAME)
 """Every text that names a kind."""
+_SHOWN = 40
+"""Letters of an unknown word that a note shows, at most."""
 
 
 def words_of_things(clip: str) -> list[str]:
@@ -40,6 +44,23 @@ def is_of_kind(name: str, text: str) -> bool:
     """Whether an object's name is a member of the kind that a text names: "toy car" and "striped ball" are toys."""
     kind, parts = _kind(text), name.lower().split()
     return kind in KINDS and (kind in parts or not KINDS[kind].isdisjoint({" ".join(parts), *parts[-1:]}))
+
+
+def unknown_note(phrase: Phrase, clip: str) -> str:
+    """A note on the words of a phrase that an encoder does not know; "" if there are none.
+
+    Args:
+        phrase: The phrase.
+        clip: Name of the encoder.
+    """
+    if clip != "bundled":
+        return ""
+    vocabulary = words_of_things(clip)
+    unknown = [word for text in things_of(phrase) for word in strange(text, vocabulary)]
+    if not unknown:
+        return ""
+    listed = ", ".join(f'"{word[:_SHOWN]}"' for word in unknown[:3])
+    return f"the bundled encoder knows English words alone, not {listed}"
 
 
 def _kind(text: str) -> str:

@@ -16,7 +16,7 @@ from torch import Tensor
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.grammar import understand, undetermined
 from lexsplat.queries.heatmaps import overlay_heatmap
-from lexsplat.queries.kinds import is_kind, is_of_kind
+from lexsplat.queries.kinds import is_kind, is_of_kind, unknown_note
 from lexsplat.queries.parts import FEWEST, part_scores, with_parts
 from lexsplat.queries.relevancy import check_prompts, render_relevancy
 from lexsplat.queries.scoring import form_used
@@ -214,7 +214,7 @@ def answer_queries(
     """
     names = [scene.view(name).name for name in views] or default_views(scene)
     found = scene.ask(prompts, threshold)
-    thresholds = found.thresholds.tolist()
+    thresholds, folders = found.thresholds.tolist(), file_names(found.prompts)
     answers: list[dict[str, Any]] = [
         {
             "prompt": prompt,
@@ -222,8 +222,7 @@ def answer_queries(
             "peak": 0.0,
             "peak_view": names[0],
             "gaussians": len(found.selection(number)),
-            "present": present,
-            "note": _note_of_grammar(prompt),
+            **_present_and_note(scene, prompt, present),
             "views": {},
         }
         for number, (prompt, limit, present) in enumerate(zip(found.prompts, thresholds, found.presences))
@@ -233,7 +232,9 @@ def answer_queries(
         image = _to_uint8(scene.render(name).image)
         relevancy = scene.relevancy(found.prompts, name).cpu().numpy()
         for answer, limit, values in zip(answers, thresholds, relevancy):
-            answer["views"][name] = _write_images(folder, answer["prompt"], name, image, values, limit)
+            answer["views"][name] = _write_images(
+                folder and folder / folders[answer["prompt"]], name, image, values, limit
+            )
             if values.max() > answer["peak"]:
                 answer["peak"], answer["peak_view"] = float(values.max()), name
     scene.listener(Event("views", len(names), len(names)))
@@ -245,16 +246,21 @@ def answer_queries(
     }
 
 
-def _note_of_grammar(prompt: str) -> str:
-    """What to ask in place of a question or a phrase with grammar, which is asked here in its own words."""
+def _present_and_note(scene: Scene, prompt: str, present: Presence) -> dict[str, str]:
+    """Presence and note of a prompt that is asked in its own words; "unsure" at most for words that are not known.
+
+    The note says what to ask in place of a question or a phrase with grammar.
+    """
+    note = ""
     with contextlib.suppress(QueryError):
         parsed = understand(prompt)
-        understood = parsed.phrase
-        if parsed.unknown:
-            return parsed.note
-        if str(understood).lower() != f'"{singular(undetermined(prompt.strip())).lower()}"':
-            return f"asked in these words; lexsplat find understands {understood}"
-    return ""
+        unknown = unknown_note(parsed.phrase, scene.clip)
+        if parsed.unknown or unknown:
+            note = "; ".join(filter(None, (parsed.note, unknown)))
+            present = "unsure" if present == "yes" else present
+        elif str(parsed.phrase).lower() != f'"{singular(undetermined(prompt.strip())).lower()}"':
+            note = f"asked in these words; lexsplat find understands {parsed.phrase}"
+    return {"present": present, "note": note}
 
 
 def rests_on(scene: Scene) -> str:
@@ -314,7 +320,7 @@ def default_views(scene: Scene) -> list[str]:
 
 
 def _write_images(
-    folder: Path | None, prompt: str, name: str, image: np.ndarray, relevancy: np.ndarray, threshold: float
+    folder: Path | None, name: str, image: np.ndarray, relevancy: np.ndarray, threshold: float
 ) -> dict[str, Any]:
     mask = relevancy >= threshold
     row, column = np.unravel_index(int(relevancy.argmax()), relevancy.shape)
@@ -327,7 +333,7 @@ def _write_images(
         return answer
     from PIL import Image
 
-    stem = folder / file_name(prompt) / Path(name).with_suffix("")
+    stem = folder / Path(name).with_suffix("")
     heatmap_path = stem.with_name(stem.name + ".png")
     mask_path = stem.with_name(stem.name + ".mask.png")
     for path, pixels in (
@@ -342,6 +348,17 @@ def _write_images(
 def file_name(prompt: str) -> str:
     """A file name for a prompt: its letters and digits, of any alphabet, joined by underscores."""
     return re.sub(r"\W+", "_", prompt.lower()).strip("_")[:80] or "prompt"
+
+
+def file_names(prompts: Sequence[str]) -> dict[str, str]:
+    """File names by prompt; of prompts that differ in other characters alone, the later ones are numbered."""
+    names: dict[str, str] = {}
+    for prompt in dict.fromkeys(prompts):
+        numbered = (
+            f"{file_name(prompt)}{end}" for end in ("", *(f"_{n}" for n in range(2, len(prompts) + 1)))
+        )
+        names[prompt] = next(name for name in numbered if name not in names.values())
+    return names
 
 
 def _to_uint8(image: torch.Tensor) -> np.ndarray:

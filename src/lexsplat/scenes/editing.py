@@ -234,12 +234,17 @@ class Editor:
             SceneFolderError: If the folder exists, or the scene was not opened from one.
         """
         source = self.original.folder
-        if source is None or output.exists():
+        if source is None:
             raise SceneFolderError(
                 output,
-                expected="a new folder and a scene that was opened from one",
-                found="a scene in memory" if source is None else "a folder that exists",
-                remedy="give another --output",
+                expected="a scene that was opened from a folder",
+                found="a scene in memory",
+                remedy="open it with open_scene",
+            )
+        if output.exists():
+            found = f"a {'folder' if output.is_dir() else 'file'} that exists"
+            raise SceneFolderError(
+                output, expected="a new folder", found=found, remedy="give another --output"
             )
         folder = SceneFolder(output)
         record = json.loads(json.dumps(source.record))

@@ -11,10 +11,10 @@ import torch
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.answering import Searched, answer
 from lexsplat.queries.grammar import understand
-from lexsplat.queries.kinds import words_of_things
+from lexsplat.queries.kinds import unknown_note, words_of_things
 from lexsplat.queries.phrases import Phrase, Thing, Understood, mended_note, things_of, with_things
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.spelling import spellings, strange
+from lexsplat.queries.spelling import spellings
 from lexsplat.queries.wording import thing_of
 from lexsplat.scenes.objects import object_colors
 
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 _SHORT = 60
 """Letters of a thing that every encoder reads whole; with longer ones it is asked."""
-_SHOWN = 40
-"""Letters of an unknown word that a note shows, at most."""
 
 
 def understood_in(scene: Scene, phrase: str) -> Understood:
@@ -55,23 +53,6 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
     notes = [*filter(None, (understood.note, mended_note(mended)))]
     unknown = unknown_note(found, scene.clip)
     return Understood(found, "; ".join(filter(None, (*notes, unknown))), unknown=bool(unknown))
-
-
-def unknown_note(phrase: Phrase, clip: str) -> str:
-    """A note on the words of a phrase that an encoder does not know; "" if there are none.
-
-    Args:
-        phrase: The phrase.
-        clip: Name of the encoder.
-    """
-    if clip != "bundled":
-        return ""
-    vocabulary = words_of_things(clip)
-    unknown = [word for text in things_of(phrase) for word in strange(text, vocabulary)]
-    if not unknown:
-        return ""
-    listed = ", ".join(f'"{word[:_SHOWN]}"' for word in unknown[:3])
-    return f"the bundled encoder knows English words alone, not {listed}"
 
 
 def _tokens_over(scene: Scene, text: str) -> int:

@@ -21,6 +21,7 @@ import io
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -99,11 +100,14 @@ class SceneFolder:
             root = BUNDLED_SCENE
         if not (Path(root) / "scene.json").is_file():
             found = "no scene.json in it" if Path(root).is_dir() else "a file" if Path(root).exists() else ""
+            from lexsplat.scenes.formats.reading import is_splats
+
+            way = f"language --splats {quote(str(root))}" if is_splats(Path(root)) else "build CAPTURE"
             raise SceneFolderError(
                 root,
                 expected="a scene folder",
                 found=found or "no such folder",
-                remedy="make one with: lexsplat build CAPTURE --output SCENE",
+                remedy=f"make one with: lexsplat {way} --output SCENE",
             )
         return cls(root)
 

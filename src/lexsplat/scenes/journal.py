@@ -45,7 +45,9 @@ class Step:
     phrase: str = ""
 
     def __str__(self) -> str:
-        return f"{self.kind} {self.phrase or 'a selection'} ({int(self.mask.sum())} Gaussians)"
+        fill = self.values.get("fill")
+        filled = f", filled with {fill['gaussians']}" if fill else ""
+        return f"{self.kind} {self.phrase or 'a selection'} ({int(self.mask.sum())} Gaussians{filled})"
 
     def to_json(self) -> dict[str, Any]:
         """Plain data; the mask as compressed bits."""

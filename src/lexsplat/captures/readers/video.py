@@ -62,6 +62,16 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
 
 
+def require_video(video: Path) -> None:
+    """Refuse a path without a file.
+
+    Raises:
+        CaptureError: If there is none.
+    """
+    if not video.is_file():
+        raise CaptureError(video, expected="a video", found="no such file", remedy="check the path")
+
+
 def sample_video(
     video: Path,
     folder: Path,
@@ -92,8 +102,7 @@ def sample_video(
     """
     if count < 3:
         raise ValueError(f"count must be at least 3, got {count}")
-    if not video.is_file():
-        raise CaptureError(video, expected="a video", found="no such file", remedy="check the path")
+    require_video(video)
     inputs = {"video": _identity(video), "count": count, "version": 1}
     kept = _written_before(folder, inputs)
     if kept is not None:

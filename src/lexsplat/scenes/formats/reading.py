@@ -49,15 +49,29 @@ def read_splats(path: Path) -> Gaussians:
     path = splat_file(path)
     if _is_gzip(path):
         raise FileFormatError(path, expected="splats", found="gzip", remedy="unpack it first: gunzip FILE.gz")
+    return renderable(reader_of(path)(path), path)
+
+
+def reader_of(path: Path) -> Callable[[Path], Gaussians]:
+    """The reader for the ending of a name.
+
+    Raises:
+        FileFormatError: If the ending is none of `READERS`.
+    """
     for ending, read in READERS.items():
         if path.name.lower().endswith(ending):
-            return renderable(read(path), path)
+            return read
     raise FileFormatError(
         path,
         expected="a name that ends in " + ", ".join(READERS),
         found=repr(path.suffix),
         remedy="export the splats in one of these formats",
     )
+
+
+def is_splats(path: Path) -> bool:
+    """Whether a path is a file with the name of splats."""
+    return path.is_file() and path.name.lower().endswith(tuple(READERS))
 
 
 def splat_file(path: Path) -> Path:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 from lexsplat.queries.grammar import thing_of
-from lexsplat.queries.kinds import words_of_things
+from lexsplat.queries.kinds import unknown_note, words_of_things
 from lexsplat.queries.phrases import Phrase, Thing, Understood, with_things
 from lexsplat.queries.spelling import corrected
-from lexsplat.scenes.finding import unknown_note
 from lexsplat.scenes.library.found import Hit
 from lexsplat.scenes.serving import shortened
 
