@@ -354,14 +354,12 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(bro
         (lambda m: m.update(language=None), "language or a server"),
         (
             lambda m: m["language"].update(segments="s", segment_rule=None),
-            "7 numbers in language.segment_rule",
+            "5 numbers in language.segment_rule",
         ),
         (
             lambda m: m["language"].update(
                 segments="s",
-                segment_rule=dict.fromkeys(
-                    ("lowest", "border", "below", "least", "own_share", "steepness", "threshold"), 1
-                ),
+                segment_rule=dict.fromkeys(("lowest", "border", "own_share", "steepness", "threshold"), 1),
             ),
             "18 numbers in language.part_rule",
         ),

@@ -74,10 +74,6 @@ export interface SegmentRule {
   lowest: number;
   /** Levels whose taken segments lie below this do not compete. */
   border: number;
-  /** Levels between the one that answers and the parts of its segments, which may be left. */
-  below: number;
-  /** Parts of taken segments below this share of the cut are left. */
-  least: number;
   /** Share of a splat's own relevancy in its score; the rest is its segment's. */
   own_share: number;
   steepness: number;
@@ -238,7 +234,7 @@ const FIELDS: [string, string, (value: unknown) => boolean][] = [
   ["views", "a list of cameras", areViews],
 ];
 
-const SEGMENT_RULE = ["lowest", "border", "below", "least", "own_share", "steepness", "threshold"];
+const SEGMENT_RULE = ["lowest", "border", "own_share", "steepness", "threshold"];
 const PART_RULE = [
   "fewest", "neighbors", "color", "score", "rounds", "shared", "best", "lowest", "mostly", "all", "usual", "spread", "first", "last",
   "steps", "near", "few", "outside",

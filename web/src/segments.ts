@@ -75,21 +75,18 @@ export class Segments {
     const labels = this.labels;
     const masses = this.masses;
     for (let i = 0; i < own.length; i++) lowest[labels[i]] += masses[i] * own[i];
-    const levels = this.#levels;
-    const { border, below, least, own_share: share, steepness, threshold } = this.rule;
-    const cuts = levels.map((level) => cutOf(level, lowest, this.#sums, this.rule.lowest));
-    let place = cuts.length - 1; // coarse levels first: of equal gaps the first one wins
-    for (let at = place - 1; at >= 0; at--) if (before(cuts[place], cuts[at], border)) place = at;
-    const [cut, level] = [cuts[place], levels[place]];
-    const under = Math.max(place - below, 0);
-    const [parts, part] = [cuts[under].scores, levels[under]];
-    const isTaken = (label: number): boolean =>
-      cut.scores[level[label]] >= cut.limit && parts[part[label]] >= least * cut.limit;
+    let best: { cut: Cut; level: Uint32Array } | null = null;
+    for (const level of [...this.#levels].reverse()) {
+      const cut = cutOf(level, lowest, this.#sums, this.rule.lowest); // coarse levels first: of equal gaps the first one wins
+      if (best === null || before(best.cut, cut, this.rule.border)) best = { cut, level };
+    }
+    const { cut, level } = best!;
+    const { own_share: share, steepness, threshold } = this.rule;
     const spread = Math.max(cut.taken - cut.left, 1e-6);
     // What all splats of a lowest segment share is computed once: a scene has millions of splats.
     const slope = steepness / spread;
     const shared = lowest.map((_, label) => ((1 - share) * cut.scores[level[label]] - cut.limit) * slope);
-    const floor = lowest.map((_, label) => threshold * Number(isTaken(label)));
+    const floor = lowest.map((_, label) => threshold * Number(cut.scores[level[label]] >= cut.limit));
     const scores = new Float32Array(own.length);
     for (let i = 0; i < own.length; i++) {
       const odds = Math.min(60, Math.max(-60, own[i] * share * slope + shared[labels[i]]));

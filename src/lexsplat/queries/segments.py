@@ -7,9 +7,6 @@ parts score alike, and its handle alone where only the handle scores high. As lo
 0.5, levels whose taken segments lie below it do not compete: what is taken there resembles the prompt a little more
 than the rest, such as the whole mug for "mug handle".
 
-A coarse segment may reach beyond its thing, as that of a ring does along the edge of the cloth under it. So its parts
-three levels below, each an eighth of it, are left where they score clearly below the cut.
-
 The result is a score in 0..1 for each Gaussian. It is at least 0.5 exactly for Gaussians of taken segments, so the
 threshold of masks and of selections is 0.5 for every prompt. Dimension letters: P prompts, N Gaussians, L levels,
 S segments.
@@ -33,10 +30,6 @@ LOWEST = 0.6
 """A cut is above this share of the best segment's score."""
 BORDER = 0.5
 """Levels whose taken segments lie below this do not compete."""
-BELOW = 3
-"""Levels between the one that answers and the parts of its segments, which may be left."""
-LEAST = 0.7
-"""Parts of taken segments below this share of the cut are left."""
 OWN_SHARE = 0.7
 """Share of a Gaussian's own relevancy in its score; the rest is its segment's."""
 STEEPNESS = 8.0
@@ -93,8 +86,6 @@ def segment_relevancy(relevancy: Tensor, segments: Segments) -> Tensor:
         place = len(cuts) - 1 - max(range(len(cuts)), key=lambda key: (keys[key], -key))
         cut = cuts[place]
         at_lowest = cut.scores[prompt][levels[place]]
-        below = max(place - BELOW, 0)
-        parts = cuts[below].scores[prompt][levels[below]]
         limit, spread = cut.limits[prompt], max(cut.taken[prompt] - cut.left[prompt], 1e-6)
         # Single precision, in place: this is all that is done for each Gaussian.
         odds = ((1 - OWN_SHARE) * at_lowest - limit).astype(np.float32)[labels]
@@ -103,8 +94,7 @@ def segment_relevancy(relevancy: Tensor, segments: Segments) -> Tensor:
         steep = np.exp(np.clip(odds, -60, 60, out=odds), out=odds)
         steep += 1
         np.divide(np.float32(1 - SEGMENT_THRESHOLD), steep, out=result[prompt])
-        taken = (at_lowest >= limit) & (parts >= LEAST * limit)
-        result[prompt] += np.where(taken, SEGMENT_THRESHOLD, 0.0).astype(np.float32)[labels]
+        result[prompt] += np.where(at_lowest >= limit, SEGMENT_THRESHOLD, 0.0).astype(np.float32)[labels]
     return torch.from_numpy(result).to(relevancy)
 
 

@@ -36,8 +36,6 @@ def segment_rule() -> dict[str, float]:
     return {
         "lowest": rule.LOWEST,
         "border": rule.BORDER,
-        "below": rule.BELOW,
-        "least": rule.LEAST,
         "own_share": rule.OWN_SHARE,
         "steepness": rule.STEEPNESS,
         "threshold": rule.SEGMENT_THRESHOLD,
