@@ -19,6 +19,9 @@ import time
 
 from records import argument_parser, write_record
 
+from lexsplat.queries.vocabulary import COLORS
+
+THINGS = ("shoe", "hat", "glove", "bench", "piano", "drum", "fence", "statue", "carpet", "mirror")
 LIMITS = {"--help": 0.5, "info": 1.3, "query": 2.2, "find": 2.2}
 """Multiples of the import of torch that are wanted, by command."""
 TORCH = "import torch"
@@ -45,13 +48,19 @@ def run(arguments: list[str], folder: str) -> tuple[float, float]:
     return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
+def phrase(number: int) -> str:
+    """A thing with a color that no scene and no cache knows yet."""
+    color, thing = divmod(number % (len(COLORS) * len(THINGS)), len(THINGS))
+    return f"{COLORS[color]} {THINGS[thing]}"
+
+
 def measure(repeats: int) -> list[dict[str, object]]:
     """A row for each command."""
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in CASES}
     with tempfile.TemporaryDirectory() as folder:
         for number in range(repeats + 1):
             for name, arguments in CASES.items():
-                words = [word.format(word=f"thing number {number}") for word in arguments]
+                words = [word.format(word=phrase(number)) for word in arguments]
                 found = run(words, folder)
                 if number:
                     times[name].append(found)
