@@ -50,8 +50,8 @@ def run(arguments: list[str], folder: str) -> tuple[float, float]:
 
 def phrase(number: int) -> str:
     """A thing with a color that no scene and no cache knows yet."""
-    color, thing = divmod(number % (len(COLORS) * len(THINGS)), len(THINGS))
-    return f"{COLORS[color]} {THINGS[thing]}"
+    colors = sorted(COLORS)
+    return f"{colors[number // len(THINGS) % len(colors)]} {THINGS[number % len(THINGS)]}"
 
 
 def measure(repeats: int) -> list[dict[str, object]]:
