@@ -8,7 +8,7 @@ sixth training view instead, to choose settings by.
 
 Schedules are scaled to the length of a training, so a training that is cut off is worse than one that is planned to
 end there. ``--lengths .3 .4 .6 1`` therefore runs a whole training of each share of the usual steps, and interpolates
-between their ends: the seconds of the shortest training that reaches the PSNR.
+between their ends: the seconds of the shortest training that reaches the PSNR, at most those of the shortest length.
 """
 
 from __future__ import annotations
@@ -80,6 +80,8 @@ def seconds_to(goal: float, rows: Sequence[Mapping[str, float]], clock: str) -> 
     above = [row["psnr"] >= goal for row in rows]
     if not above[-1]:
         return None
+    if all(above):
+        return rows[0][clock]
     first = len(above) - above[::-1].index(False)
     before, after = rows[first - 1], rows[first]
     share = (goal - before["psnr"]) / (after["psnr"] - before["psnr"])
@@ -137,8 +139,7 @@ def compared(capture: str, seed: int, base: Path, options: argparse.Namespace) -
     goal = options.goal or GOALS[name]
     if options.lengths:
         ends = [trained(capture, seed, base, options, share) for share in sorted(options.lengths)]
-        start = {"steps": 0, "wall": 0.0, "processor": 0.0, "psnr": 0.0}
-        curves = {version: [start, *(end[version][-1] for end in ends)] for version in ("base", "ours")}
+        curves = {version: [end[version][-1] for end in ends] for version in ("base", "ours")}
     else:
         curves = trained(capture, seed, base, options, 1.0)
     row: dict[str, Any] = {"capture": name, "seed": seed, "goal": goal}
