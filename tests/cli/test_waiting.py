@@ -11,9 +11,25 @@ from lexsplat.cli.waiting import LateProgress
 from lexsplat.runtime.progress import Event
 
 
-def test_a_quick_stage_shows_nothing_and_a_slow_one_its_rate(capsys, monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
+@pytest.fixture
+def now(monkeypatch) -> list[float]:
+    """The time of the monotonic clock, to be changed."""
+    clock = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    return clock
+
+
+@pytest.fixture
+def listener(now, capsys) -> LateProgress:
+    """One that shows a slow stage, "page", after the first of six units."""
+    late = LateProgress()
+    late(Event("page", 0, 6))
+    now[0] += 3.0
+    late(Event("page", 1, 6))
+    return late
+
+
+def test_a_quick_stage_shows_nothing_and_a_slow_one_its_rate(now, capsys):
     listener = LateProgress()
     for done in range(1, 11):  # one second in all
         now[0] += 0.1
@@ -40,13 +56,7 @@ def test_a_stage_that_sends_nothing_is_shown_after_the_time(capsys):
     assert "page: 6/6" in capsys.readouterr().err
 
 
-def test_a_quick_stage_within_a_slow_one_does_not_end_its_progress(capsys, monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
-    listener = LateProgress()
-    listener(Event("page", 0, 6))
-    now[0] += 3.0
-    listener(Event("page", 1, 6))
+def test_a_quick_stage_within_a_slow_one_does_not_end_its_progress(listener, now, capsys):
     listener(Event("words", 0, 2))
     listener(Event("words", 2, 2))
     now[0] += 20.0
@@ -57,13 +67,7 @@ def test_a_quick_stage_within_a_slow_one_does_not_end_its_progress(capsys, monke
     listener(Event("page", 6, 6))
 
 
-def test_quick_stages_within_a_slow_one_are_not_shown_and_slow_ones_are(capsys, monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
-    listener = LateProgress()
-    listener(Event("page", 0, 6))
-    now[0] += 3.0
-    listener(Event("page", 1, 6))
+def test_quick_stages_within_a_slow_one_are_not_shown_and_slow_ones_are(listener, now, capsys):
     for _ in range(20):  # each of one word
         listener(Event("words", 0, 1))
         listener(Event("words", 1, 1))
