@@ -75,7 +75,7 @@ def test_every_row_of_the_papers_table_switches_off_its_part():
 def test_each_method_has_the_variants_that_change_it():
     table_2 = ("w/o DINO", "w/o L_lb", "w/o u_G", "w/o MLP", "w/o u_G & MLP", "full")
     assert tuple(METHODS["trained"].variants) == table_2
-    assert tuple(METHODS["averaged"].variants) == ("one code", "with DINO", "full")
+    assert tuple(METHODS["averaged"].variants) == ("one code", "w/o DINO", "with DINO", "full")
     assert set(VARIANTS) == {*table_2, "one code", "with DINO"}
     assert ablation.changed(BuildConfig(), "one code").averaged.top == 1
     with pytest.raises(ValueError, match="averaged"):

@@ -174,6 +174,7 @@ def test_a_missing_network_leaves_three_remedies(fake, load):
     refused(
         "someone/model", "cannot be reached", "internet", f"--{kind} FOLDER", f"--{kind} bundled", load=load
     )
+    refused("someone/model", "go without (`--dino none`)", load=load_dino)
 
 
 def test_each_cause_has_its_own_message(fake):

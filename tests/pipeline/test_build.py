@@ -86,7 +86,8 @@ def test_stages_are_those_of_the_method_and_a_second_build_keeps_all(
         (AVERAGED, {"averaged": AveragedConfig(top=3)}, {"language"}),
         (AVERAGED, {"codebook": replace(CONFIG.codebook, num_codes=5)}, {"language"}),
         (AVERAGED, {"trained": TrainedConfig(iterations=3)}, set()),
-        (AVERAGED, {"memory": "1GB", "checkpoint_seconds": 0.0, "dino": "none"}, set()),
+        (AVERAGED, {"memory": "1GB", "checkpoint_seconds": 0.0}, set()),
+        (AVERAGED, {"dino": "none"}, {"features", "language"}),
         (AVERAGED, {"iterations": 5}, {"reconstruct", "language"}),
         (TRAINED, {"averaged": AveragedConfig(top=3)}, set()),
         (TRAINED, {"trained": replace(CONFIG.trained, iterations=3)}, {"language"}),
@@ -153,8 +154,12 @@ def loaded(tmp_path, monkeypatch) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("config", "expected"),
-    [(TRAINED, ["clip", "dino"]), (AVERAGED, ["clip"])],
-    ids=["trained", "averaged, which needs no DINO"],
+    [
+        (TRAINED, ["clip", "dino"]),
+        (AVERAGED, ["clip", "dino"]),
+        (replace(AVERAGED, averaged=AveragedConfig(dino=False)), ["clip"]),
+    ],
+    ids=["trained", "averaged from class tokens", "averaged without DINO"],
 )
 def test_a_build_loads_each_encoder_once_for_check_photos_and_texts(
     tiny_capture, tmp_path, loaded, config, expected

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -152,6 +153,21 @@ def test_dino_is_loaded_where_it_takes_part():
     asked = BuildConfig(averaged=AveragedConfig(dino=True))
     assert asked.uses_dino
     assert not replace(asked, dino="none").uses_dino
+
+
+def test_averaging_takes_dino_for_class_tokens_and_not_for_patches():
+    def used(**settings: object) -> bool:
+        return BuildConfig(**settings).resolved("cpu", (10, 10)).uses_dino  # type: ignore[arg-type]
+
+    classes = FeatureConfig(crop_tokens="class")
+    assert not used(clip="bundled"), "the bundled encoder is read at its patches, too"
+    assert used(clip="bundled", features=classes)
+    assert used(clip="bundled", features=FeatureConfig(mode="random")), "random crops have no patches"
+    assert used(clip="bundled", averaged=AveragedConfig(dino=True))
+    assert not used(clip="bundled", features=classes, averaged=AveragedConfig(dino=False))
+    assert not used(clip="bundled", features=classes, dino="none")
+    assert not used(clip="bundled", features=classes, features_from=Path("features"))
+    assert BuildConfig().resolved("cuda", (10, 10)).uses_dino, "a GPU reads CLIP at class tokens"
 
 
 def test_result_settings_keep_those_of_the_chosen_method_only():

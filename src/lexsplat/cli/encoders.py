@@ -9,7 +9,7 @@ import tyro
 
 from lexsplat.cli.options import Device, print_json
 from lexsplat.cli.waiting import LateProgress, starting
-from lexsplat.features.encoders import DEFAULT_CLIP
+from lexsplat.features.encoders import DEFAULT_CLIP, DEFAULT_DINO
 from lexsplat.runtime.progress import Event
 
 _PHOTOS, _SIZE = 100, (1440, 1080)
@@ -25,7 +25,8 @@ class EncodersCommand:
 
     Args:
         clip: Image-text encoder: a name on the Hugging Face Hub, a folder, or "bundled".
-        dino: Dense encoder to check, too: a name, a folder, or "bundled". The default method needs none.
+        dino: Dense encoder to check, too: a name, a folder, "bundled", or "none". By default
+            that of a build, which needs one where CLIP is read at class tokens only.
         capture: Folder of photos or capture for which the time is stated.
         device: Device of the rasterizer.
         encoder_device: Device of the encoders; "auto" takes that of the rasterizer.
@@ -39,7 +40,10 @@ class EncodersCommand:
     encoder_device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     json: bool = False
 
-    defaults: ClassVar[dict[str, str]] = {"capture": f"{_PHOTOS} photos of {_SIZE[0]}x{_SIZE[1]}"}
+    defaults: ClassVar[dict[str, str]] = {
+        "dino": "that of a build, if it needs one",
+        "capture": f"{_PHOTOS} photos of {_SIZE[0]}x{_SIZE[1]}",
+    }
 
     def run(self) -> None:
         """Print what was found.
@@ -58,7 +62,10 @@ class EncodersCommand:
 
         photos, size = _PHOTOS, _SIZE
         config = BuildConfig(
-            clip=self.clip, dino=self.dino or "none", device=self.device, encoder_device=self.encoder_device
+            clip=self.clip,
+            dino=self.dino or DEFAULT_DINO,
+            device=self.device,
+            encoder_device=self.encoder_device,
         )
         if self.capture is not None:
             survey = count_photos(_place(self.capture), config)
@@ -67,7 +74,8 @@ class EncodersCommand:
         config = config.resolved(choose_device(self.device), size)
         progress = LateProgress()
         progress(Event("encoders", 0, 4))
-        encoders = Encoders(config.clip, config.dino, config.encoder_device)
+        dino = config.dino if self.dino or config.uses_dino else "none"
+        encoders = Encoders(config.clip, dino, config.encoder_device)
         clip = encoders.clip
         progress(Event("encoders", 1, 4))
         facts: dict[str, Any] = {"clip": _facts(clip) | {"words_ranked": check_words(clip)}}

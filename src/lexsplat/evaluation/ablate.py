@@ -122,7 +122,10 @@ def ablate(bench: Bench, plan: AblationPlan | None = None) -> list[dict[str, Any
             if variant not in METHODS[method].variants:
                 log.warning("%s has no variant %r: the row is left out", method, variant)
                 continue
-            config = changed(replace(bench.config, method=method), variant)
+            full = replace(bench.config, method=method)
+            config = changed(full, variant)
+            if not plan.variants and variant != "full" and config == full:
+                continue  # for class tokens the full method has DINO, for others it has none
             name = variant if len(plan.methods) == 1 else f"{method}: {variant}"
             for form in plan.forms:
                 row = name if len(plan.forms) == 1 else f"{name}, {form}"

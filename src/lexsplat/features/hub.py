@@ -356,6 +356,7 @@ def _megabytes(size: int) -> str:
 
 def _choices(tower: str) -> str:
     other = _OTHERS.get(tower, f"the small bundled encoder (`--{tower} bundled`)")
+    other += "; or go without (`--dino none`)" if tower == "dino" else ""
     return f"give another model, a folder (`{_option(tower)} FOLDER`), or {other}"
 
 

@@ -235,6 +235,10 @@ class BuildConfig:
             reads_patches = features.mode == "grid" and features.crop_tokens != "class"
             patches = patch_grid(self.clip) if reads_patches else 0
             features = features.on_top_of(FeatureConfig.sparse(patches))
+        averaged = self.averaged
+        if averaged.dino is None:
+            with_dino = features.tokens == "class" and self.dino != "none" and self.features_from is None
+            averaged = replace(averaged, dino=with_dino)
         iterations = self.iterations
         if iterations is None and self.reconstruction.iterations != ReconstructionConfig.iterations:
             iterations = self.reconstruction.iterations  # set from Python
@@ -248,5 +252,6 @@ class BuildConfig:
             downscale=downscale,
             iterations=iterations,
             features=features,
+            averaged=averaged,
             reconstruction=replace(self.reconstruction, iterations=iterations),
         )

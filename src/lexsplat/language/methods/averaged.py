@@ -8,7 +8,7 @@ feature, so its own feature is the weighted mean over all pixels of all training
     F_n = sum alpha T F(p) / sum alpha T,
 
 the transpose of rendering (as in LUDVIG and Occam's LGS). Averaging cancels what is wrong in single views. The
-codebook is then fitted to the Gaussians (Eq. 2 to 4; without the DINO half unless asked for), and each Gaussian
+codebook is then fitted to the Gaussians (Eq. 2 to 4; with the DINO half for class tokens only), and each Gaussian
 carries a softmax over its nearest codes. The length of the mean of unit vectors measures how far the views agree,
 which gives u_G: 0 for a mean of length 1, and 1 for a mean no longer than that of all features of the scene.
 
@@ -65,7 +65,8 @@ class AveragedConfig:
         prior_visibility: Weight in cells at which a Gaussian's mean is half trusted; below it u tends to 1.
         shortest_side: Views are rendered at the size of their feature maps, but not below this many pixels on the
             short side, and reduced by at most `lexsplat.language.methods.averaging.MOST_REDUCED`.
-        dino: Average DINO features, too, and compare Gaussians with codes by both halves (Eq. 4).
+        dino: Average DINO features, too, and compare Gaussians with codes by both halves (Eq. 4). By default a build
+            does so where CLIP is read at class tokens only (`FeatureConfig.crop_tokens`), which gain by it.
         segments: Whether to find segments (`lexsplat.language.segments`), by which questions are answered.
     """
 
@@ -74,7 +75,7 @@ class AveragedConfig:
     min_visibility: float = 0.01
     prior_visibility: float = 0.25
     shortest_side: int = 120
-    dino: bool = False
+    dino: bool | None = None
     segments: bool = True
 
     def __post_init__(self) -> None:
@@ -95,12 +96,13 @@ class Averaged:
     stages = ("reconstruct", *needs, "language")
     variants: Mapping[str, Variant] = {
         "one code": {"averaged": {"top": 1}},
+        "w/o DINO": {"averaged": {"dino": False}},
         "with DINO": {"averaged": {"dino": True}},
         "full": {},
     }
 
     def uses_dino(self, config: Any) -> bool:
-        """If asked for."""
+        """If asked for, and in resolved settings for class tokens."""
         return bool(config.averaged.dino)
 
     def fit(self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> CodeField:
