@@ -1,6 +1,7 @@
-"""OpenSplat on a CPU, for `peers.py`: a program that is on this machine, run on the capture of the others.
+"""OpenSplat on a CPU, for `peers.py`: a program that is on this machine or is built there, run beside the others.
 
-OpenSplat is AGPL and stays a program of its own: nothing here links, copies or builds it.
+OpenSplat is AGPL and stays a program of its own: nothing here links or copies it. A build needs git, CMake, a C++
+compiler and OpenCV; torch is that of this environment.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -26,13 +28,65 @@ from lexsplat.scenes.formats.reading import read_splats
 BACKGROUND = (0.6130, 0.0101, 0.3984)
 """The color OpenSplat trains over."""
 
+SOURCES = "https://github.com/pierotofy/OpenSplat.git"
+REVISION = "15b7e80016bb25107f07956b5682231f226f62b9"
+"""The commit that was measured."""
+FETCH = "fetch"
+"""In place of a program: fetch the sources and build them."""
+
 
 class Skipped(Exception):
     """A peer cannot run here; the message is the reason."""
 
 
+def find_opensplat(place: str | None, folder: Path) -> str:
+    """The program, built if its sources are given or to be fetched.
+
+    Args:
+        place: The program, a folder of its sources, or `FETCH`.
+        folder: Where fetched sources are kept. They are not fetched or built again.
+
+    Raises:
+        Skipped: If there is none, or it cannot be fetched or built.
+    """
+    if place is None:
+        raise Skipped(
+            f"no program opensplat on the path; name one, or its sources, with --opensplat, or {FETCH}"
+        )
+    if place == FETCH:
+        if not (folder / "CMakeLists.txt").is_file():
+            _run("git", "clone", "--quiet", SOURCES, str(folder))
+            _run("git", "-C", str(folder), "checkout", "--quiet", REVISION)
+        place = str(folder)
+    if not Path(place).is_dir():
+        return place
+    build = Path(place) / "build"
+    # What an earlier configuration was told, such as where its libraries are, holds on.
+    _run(
+        "cmake", "-S", place, "-B", str(build), "-DCMAKE_BUILD_TYPE=Release", "-DGPU_RUNTIME=CPU",
+        f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}",
+    )  # fmt: skip
+    _run("cmake", "--build", str(build), "--target", "opensplat")
+    return str(build / "opensplat")
+
+
+def _run(*command: str) -> None:
+    """Run a program to its end.
+
+    Raises:
+        Skipped: If it is missing or fails, with what it said last.
+    """
+    try:
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    except OSError as error:
+        raise Skipped(f"{command[0]} does not start: {error.strerror}") from error
+    if done.returncode:
+        said = [line.strip() for line in done.stdout.splitlines() if line.strip()] or ["nothing printed"]
+        raise Skipped(f"{command[0]} ended with status {done.returncode}: {said[-1]}")
+
+
 def train_opensplat(
-    program: str | None, capture: Capture, points: InitialPoints, steps: int, threads: int
+    program: str, capture: Capture, points: InitialPoints, steps: int, threads: int
 ) -> tuple[Gaussians, NDArray, int]:
     """Train all steps at full resolution, from the same points and training views.
 
@@ -40,10 +94,8 @@ def train_opensplat(
         The Gaussians, processor and wall seconds ``[steps - 1, 2]`` between its steps, and its peak memory in bytes.
 
     Raises:
-        Skipped: If there is no such program, or it fails.
+        Skipped: If it fails.
     """
-    if program is None:
-        raise Skipped("no program opensplat on the path; name one with --opensplat")
     if sys.platform != "linux":
         raise Skipped("its processor time is read in a way that only Linux has")
     with tempfile.TemporaryDirectory() as folder:

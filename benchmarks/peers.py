@@ -1,12 +1,13 @@
 """Other trainers on a CPU beside ours: time of a step, PSNR and memory on the same capture.
 
-    python benchmarks/peers.py [--capture demo|second] [--steps 30] [--repeats 3] [--opensplat PROGRAM] [--json FILE]
+    python benchmarks/peers.py [--capture demo|second] [--steps 30] [--repeats 3]
+        [--opensplat PROGRAM|SOURCES|fetch] [--json FILE]
 
     lexsplat    our trainer with the Numba kernels
     gsplat      our trainer with gsplat's torch functions for projection, colors and tile lists, blended by torch
                 operations with autograd; gsplat's own torch blending needs a CUDA build of nerfacc
     naive       `naive.py`: the trainer of the paper in torch operations
-    OpenSplat   a program that is on this machine; skipped without one
+    OpenSplat   a program that is on this machine, or is built from its sources; skipped without one
 
 All train on the same photos of the same size from the same points, and all schedules end with the last step. The rest
 is each trainer's own: learning rates, order of views, degrees of colors, density control. Each peer trains in a
@@ -33,8 +34,8 @@ from typing import Any
 import numpy as np
 import torch
 from naive import LAST_STEP, TILE, NaiveTrainer, blend
-from opensplat import BACKGROUND, Skipped, train_opensplat
-from records import argument_parser, write_record
+from opensplat import BACKGROUND, Skipped, find_opensplat, train_opensplat
+from records import REPOSITORY, argument_parser, write_record
 from torch import Tensor
 
 from lexsplat.captures import initial_points, load_capture
@@ -106,9 +107,8 @@ def train(peer: str, options: Namespace) -> dict[str, float]:
     points = initial_points(capture, seed=0)
     background = torch.tensor(capture.background)
     if peer == "OpenSplat":
-        gaussians, seconds, peak = train_opensplat(
-            options.opensplat, capture, points, options.steps, options.threads
-        )
+        program = find_opensplat(options.opensplat, REPOSITORY / "output" / "opensplat")
+        gaussians, seconds, peak = train_opensplat(program, capture, points, options.steps, options.threads)
         background = torch.tensor(BACKGROUND)
     else:
         trainer: NaiveTrainer | Reconstructor
@@ -153,7 +153,10 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--threads", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument(
-        "--opensplat", metavar="PROGRAM", default=shutil.which("opensplat"), help="default: that on the path"
+        "--opensplat",
+        metavar="PROGRAM|SOURCES|fetch",
+        default=shutil.which("opensplat"),
+        help="the program, a folder of its sources, or fetch; by default the program on the path",
     )
     parser.add_argument(
         "--only", choices=PEERS, help="train one peer in this process and print its numbers as JSON"
@@ -169,6 +172,11 @@ def main() -> None:
         return
     runs: dict[str, list[dict[str, float]]] = {peer: [] for peer in PEERS}
     skipped = {}
+    try:  # here, so that it is built once
+        options.opensplat = find_opensplat(options.opensplat, REPOSITORY / "output" / "opensplat")
+    except Skipped as reason:
+        skipped["OpenSplat"] = str(reason)
+        del runs["OpenSplat"]
     for _ in range(options.repeats):
         for peer in [peer for peer in PEERS if peer not in skipped]:
             found = train_elsewhere(peer, options)

@@ -164,17 +164,19 @@ def test_peers_are_medians_of_repeats_and_absent_ones_have_a_reason(monkeypatch,
     found = iter([1.0, 5.0, 2.0])
 
     def train(peer, options):
-        if peer == "OpenSplat":
-            return {"skipped": "no program"}
+        if peer == "gsplat":
+            return {"skipped": "no gsplat"}
         time = next(found) if peer == "naive" else 7.0
         return {"processor_ms": time, "wall_ms": 9.0, "psnr": 20.0, "peak_bytes": 3e6, "gaussians": 1234}
 
     monkeypatch.setattr(peers, "train_elsewhere", train)
+    monkeypatch.setattr(peers.shutil, "which", lambda name: None)
     monkeypatch.setattr(sys, "argv", ["peers.py"])
     peers.main()
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[3].split() == ["naive", "2.0", "9.0", "20.00", "3", "1,234"]
-    assert lines[4].split() == ["OpenSplat", "skipped:", "no", "program"]
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert lines[2] == ["naive", "2.0", "9.0", "20.00", "3", "1,234"]
+    assert lines[3][:4] == ["OpenSplat", "skipped:", "no", "program"]
+    assert lines[4] == ["gsplat", "skipped:", "no", "gsplat"]
 
 
 def test_operations_of_an_encoder_are_those_of_its_matrix_products(monkeypatch):
@@ -254,3 +256,30 @@ def test_the_parts_of_structure_from_motion_are_timed_by_their_events(monkeypatc
         now[0] = float(at)
         clock(Event(stage, done, total))
     assert clock.taken == {"SIFT features": 21.0, "matching": 39.0}
+
+
+def test_opensplat_is_fetched_once_built_and_skipped_with_the_reason(monkeypatch, tmp_path):
+    import opensplat
+
+    programs, sources, log = tmp_path / "bin", tmp_path / "sources", tmp_path / "log"
+    programs.mkdir()
+    for name in ("git", "cmake"):  # stand-ins: one makes the sources, the other the program
+        program = programs / name
+        program.write_text(
+            f'#!/bin/sh\necho {name} "$@" >> {log}\n'
+            f'[ "$1" != clone ] || {{ mkdir {sources} && touch {sources}/CMakeLists.txt; }}\n'
+            f"[ ! -e {tmp_path}/broken ] || {{ echo no OpenCV; exit 3; }}\n"
+        )
+        program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(programs), prepend=":")
+    for _ in range(2):
+        assert opensplat.find_opensplat("fetch", sources) == str(sources / "build" / "opensplat")
+    commands = [line.split()[:2] for line in log.read_text().splitlines()]
+    built = [["cmake", "-S"], ["cmake", "--build"]]
+    assert commands == [["git", "clone"], ["git", "-C"], *built, *built]
+    assert opensplat.find_opensplat("/usr/bin/opensplat", sources) == "/usr/bin/opensplat"
+    (tmp_path / "broken").touch()
+    with pytest.raises(opensplat.Skipped, match="cmake ended with status 3: no OpenCV"):
+        opensplat.find_opensplat(str(sources), tmp_path)
+    with pytest.raises(opensplat.Skipped, match="name one, or its sources, with --opensplat"):
+        opensplat.find_opensplat(None, tmp_path)
