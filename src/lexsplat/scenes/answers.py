@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +15,9 @@ from torch import Tensor
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.grammar import understand, undetermined
 from lexsplat.queries.heatmaps import overlay_heatmap
-from lexsplat.queries.kinds import is_kind, is_of_kind, unknown_note
+from lexsplat.queries.kinds import is_kind, is_of_kind, with_unknown_words
 from lexsplat.queries.parts import FEWEST, part_scores, with_parts
+from lexsplat.queries.phrases import Thing, Understood
 from lexsplat.queries.relevancy import check_prompts, render_relevancy
 from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
@@ -44,7 +44,7 @@ class Word:
     Args:
         scores: Relevancy of every Gaussian ``[N]`` in 0..1, in the form of the query.
         own: The same for each Gaussian by itself ``[N]``.
-        presence: Whether the scene holds it.
+        presence: Whether the scene holds it, as if its words were known.
         threshold: The automatic threshold; None until it is asked for.
         selection: The selection of that threshold; None until it is asked for.
     """
@@ -98,9 +98,9 @@ class Answers:
             raise QueryError("answer", expected=f"a number from 0 to {len(self) - 1}", found=repr(index)[:40])
         if not self.words:
             return self._selection(index)
-        word = self.words[index]
-        word.selection = word.selection or self._selection(index)
-        return word.selection
+        word, present = self.words[index], self.presences[index]
+        made = word.selection = word.selection or self._selection(index)
+        return made if made.present == present else made.described(present=present)
 
     def chosen(self, index: int) -> Tensor:
         """The Gaussians ``[N]`` bool that reach the threshold of a prompt and can be seen."""
@@ -222,7 +222,8 @@ def answer_queries(
             "peak": 0.0,
             "peak_view": names[0],
             "gaussians": len(found.selection(number)),
-            **_present_and_note(scene, prompt, present),
+            "present": present,
+            "note": in_own_words(prompt, scene.clip).note,
             "views": {},
         }
         for number, (prompt, limit, present) in enumerate(zip(found.prompts, thresholds, found.presences))
@@ -246,21 +247,19 @@ def answer_queries(
     }
 
 
-def _present_and_note(scene: Scene, prompt: str, present: Presence) -> dict[str, str]:
-    """Presence and note of a prompt that is asked in its own words; "unsure" at most for words that are not known.
+def in_own_words(prompt: str, clip: str) -> Understood:
+    """What is known of a prompt that is asked in its own words.
 
     The note says what to ask in place of a question or a phrase with grammar.
     """
-    note = ""
-    with contextlib.suppress(QueryError):
+    try:
         parsed = understand(prompt)
-        unknown = unknown_note(parsed.phrase, scene.clip)
-        if parsed.unknown or unknown:
-            note = "; ".join(filter(None, (parsed.note, unknown)))
-            present = "unsure" if present == "yes" else present
-        elif str(parsed.phrase).lower() != f'"{singular(undetermined(prompt.strip())).lower()}"':
-            note = f"asked in these words; lexsplat find understands {parsed.phrase}"
-    return {"present": present, "note": note}
+    except QueryError:
+        return Understood(Thing(prompt))
+    parsed = with_unknown_words(parsed, clip)
+    if parsed.unknown or str(parsed.phrase).lower() == f'"{singular(undetermined(prompt.strip())).lower()}"':
+        return parsed if parsed.unknown else replace(parsed, note="")
+    return replace(parsed, note=f"asked in these words; lexsplat find understands {parsed.phrase}")
 
 
 def rests_on(scene: Scene) -> str:

@@ -11,7 +11,7 @@ import torch
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.answering import Searched, answer
 from lexsplat.queries.grammar import understand
-from lexsplat.queries.kinds import unknown_note, words_of_things
+from lexsplat.queries.kinds import with_unknown_words, words_of_things
 from lexsplat.queries.phrases import Phrase, Thing, Understood, mended_note, things_of, with_things
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.spelling import spellings
@@ -50,9 +50,8 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
         return thing
 
     found = with_things(understood.phrase, mend)
-    notes = [*filter(None, (understood.note, mended_note(mended)))]
-    unknown = unknown_note(found, scene.clip)
-    return Understood(found, "; ".join(filter(None, (*notes, unknown))), unknown=bool(unknown))
+    note = "; ".join(filter(None, (understood.note, mended_note(mended))))
+    return with_unknown_words(Understood(found, note), scene.clip)
 
 
 def _tokens_over(scene: Scene, text: str) -> int:
@@ -75,11 +74,12 @@ def find_in(
         threshold: See `Scene.select`. With an automatic threshold, an answer "no" has no Gaussians.
     """
     things = things_of(understood.phrase)
-    answers = scene.ask(things, threshold) if things else None
+    # A phrase is checked as a whole; words in quotation marks have no grammar.
+    answers = scene.ask(things, threshold, checked=True) if things else None
 
     def select(text: str) -> Selection:
         if answers is None or text not in things:
-            return scene.select(text, threshold)
+            return scene.ask(text, threshold, checked=True).selection(0)
         return answers.selection(things.index(text))
 
     def viewer(reference: Selection | None) -> Camera | None:
@@ -87,8 +87,8 @@ def find_in(
 
     searched = Searched(select, viewer, lambda: scene.objects, lambda thing: object_colors(scene, thing))
     found = answer(understood.phrase, searched)
-    if understood.unknown and found.present == "yes":
-        found = found.described(present="unsure")
+    if (present := understood.limit(found.present)) != found.present:
+        found = found.described(present=present)
     if found.present == "no" and threshold is None:
         return replace(found, mask=torch.zeros_like(found.mask), parts=())
     return found
