@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lexsplat.features.hub import present_name
+from lexsplat.features.hub import content_hash, model_folder, present_name
 from lexsplat.features.text import TextCache, TextTower, check_encoder, encode_each, load_text, texts_of_scene
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
@@ -417,10 +417,11 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
     Args:
         path: A folder made by ``lexsplat build`` or ``lexsplat demo``, or the word ``demo`` for the bundled scene.
         device: "auto", "cpu" or "cuda".
-        clip: Name or folder of the text encoder, if it is not where the build found it.
+        clip: Name or folder of the text encoder, if it is not where the build found it; it is checked at once.
 
     Raises:
         SceneFolderError: If the folder is not a finished scene.
+        ModelError: If ``clip`` cannot be found, or is not the encoder of the build.
         FileFormatError: If one of its files is damaged.
         BackendError: If "cuda" is asked for and there is no CUDA device.
         ValueError: If the device is not one of the three.
@@ -431,5 +432,9 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
             repr(path)[:60], expected="the path of a scene folder", found=type(path).__name__
         )
     found = read_scene(Path(path), place)
-    clip = clip or found.folder.record.get("config", {}).get("clip", "bundled")
-    return Scene(found.gaussians, found.field, found.views, clip, found.query, found.folder)
+    built_with = present_name(found.folder.record.get("config", {}).get("clip", "bundled"))
+    scene = Scene(found.gaussians, found.field, found.views, clip or built_with, found.query, found.folder)
+    needed = scene.encoder_identity().get("encoder_hash")
+    if needed and scene.clip != built_with:  # known words would be answered without the encoder
+        check_encoder(scene.clip, content_hash(model_folder(scene.clip, "clip"), "clip"), needed)
+    return scene
