@@ -12,7 +12,7 @@ from jsonschema import Draft202012Validator
 
 from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.errors import QueryError
-from lexsplat.scenes.answers import answer_queries
+from lexsplat.scenes.answers import answer_queries, find_phrase
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.scene import open_scene
 from lexsplat.scenes.serving import MAX_LINE, OpenScene, answer_line, json_line, lines_of
@@ -287,9 +287,14 @@ def test_a_word_that_is_none_and_resembles_nothing_here_is_reported(served_demo,
 
 
 def test_a_threshold_that_nothing_reaches_is_reported_in_a_whole_sentence(served_demo):
+    best = float(served_demo.scene.ask("mug").scores.max())
     answer = answer_line(served_demo, '{"ask": "mug", "threshold": 1}')
     assert (answer["count"], answer["instances"]) == (0, [])
-    assert answer["sentence"] == 'Nothing reaches the threshold 1 for "mug".'
+    assert answer["note"] == f'nothing of "mug" reaches the threshold 1: the best score is {best:.4f}'
+    assert answer["sentence"] == f'None found for "mug". Note: {answer["note"]}.'
+    related = find_phrase(served_demo.scene, "mug on the violin", None, 1.0)
+    assert (related["present"], related["note"]) == ("no", answer["note"])
+    assert find_phrase(served_demo.scene, "mug", None, best)["note"] == ""
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from lexsplat.queries.wording import thing_of
 from lexsplat.scenes.objects import object_colors
 
 if TYPE_CHECKING:
+    from lexsplat.scenes.answers import Answers
     from lexsplat.scenes.scene import Scene
 
 _SHORT = 60
@@ -71,7 +73,8 @@ def find_in(
         understood: The phrase.
         camera: Where "left" and "me" refer to; None lets the views decide that show both things
             (`lexsplat.queries.viewers`), and takes the camera in the middle of all for "me".
-        threshold: See `Scene.select`. With an automatic threshold, an answer "no" has no Gaussians.
+        threshold: See `Scene.select`. With an automatic threshold, an answer "no" has no Gaussians. The note names
+            the things that do not reach a given one.
     """
     things = things_of(understood.phrase)
     # A phrase is checked as a whole; words in quotation marks have no grammar.
@@ -89,9 +92,18 @@ def find_in(
     found = answer(understood.phrase, searched)
     if (present := understood.limit(found.present)) != found.present:
         found = found.described(present=present)
+    if answers is not None and threshold is not None:
+        found = found.described(note="; ".join(filter(None, (found.note, *_too_low(answers, threshold)))))
     if found.present == "no" and threshold is None:
         return replace(found, mask=torch.zeros_like(found.mask), parts=())
     return found
+
+
+def _too_low(answers: Answers, threshold: float) -> Iterator[str]:
+    """A note on each thing in the scene whose scores are all below a threshold."""
+    for thing, present, best in zip(answers.prompts, answers.presences, answers.scores.amax(1).tolist()):
+        if present != "no" and best < threshold:
+            yield f'nothing of "{thing}" reaches the threshold {threshold:g}: the best score is {best:.4f}'
 
 
 def middle_camera(scene: Scene) -> Camera | None:
