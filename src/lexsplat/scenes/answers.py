@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -214,7 +215,7 @@ def answer_queries(
     """
     names = [scene.view(name).name for name in views] or default_views(scene)
     found = scene.ask(prompts, threshold)
-    thresholds, folders = found.thresholds.tolist(), file_names(found.prompts)
+    thresholds = found.thresholds.tolist()
     answers: list[dict[str, Any]] = [
         {
             "prompt": prompt,
@@ -234,7 +235,7 @@ def answer_queries(
         relevancy = scene.relevancy(found.prompts, name).cpu().numpy()
         for answer, limit, values in zip(answers, thresholds, relevancy):
             answer["views"][name] = _write_images(
-                folder and folder / folders[answer["prompt"]], name, image, values, limit
+                folder and folder / file_name(answer["prompt"]), name, image, values, limit
             )
             if values.max() > answer["peak"]:
                 answer["peak"], answer["peak_view"] = float(values.max()), name
@@ -345,19 +346,15 @@ def _write_images(
 
 
 def file_name(prompt: str) -> str:
-    """A file name for a prompt: its letters and digits, of any alphabet, joined by underscores."""
-    return re.sub(r"\W+", "_", prompt.lower()).strip("_")[:80] or "prompt"
+    """A file name of its own for a prompt: its letters and digits, of any alphabet, joined by underscores.
 
-
-def file_names(prompts: Sequence[str]) -> dict[str, str]:
-    """File names by prompt; of prompts that differ in other characters alone, the later ones are numbered."""
-    names: dict[str, str] = {}
-    for prompt in dict.fromkeys(prompts):
-        numbered = (
-            f"{file_name(prompt)}{end}" for end in ("", *(f"_{n}" for n in range(2, len(prompts) + 1)))
-        )
-        names[prompt] = next(name for name in numbered if name not in names.values())
-    return names
+    Where these do not tell the prompt from others, such as "Mug!" from "mug", a hash of the prompt follows.
+    """
+    name = re.sub(r"\W+", "_", prompt.lower()).strip("_")[:80]
+    if name.replace("_", " ") == prompt:
+        return name
+    own = hashlib.blake2b(prompt.encode("utf-8", "surrogatepass"), digest_size=4).hexdigest()
+    return f"{name or 'prompt'}_{own}"
 
 
 def _to_uint8(image: torch.Tensor) -> np.ndarray:
