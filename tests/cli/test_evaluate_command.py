@@ -50,7 +50,9 @@ def test_info_states_the_method_and_its_codes(built, capsys):
 
 @pytest.mark.parametrize("option", ["--ground-truth", "--masks"])
 def test_ground_truth_that_is_given_and_missing_ends_in_one_line(option, built, tmp_path, capsys):
-    fails_in_one_line(capsys, ["evaluate", str(built), option, str(tmp_path / "nowhere")], "nowhere")
+    fails_in_one_line(
+        capsys, ["evaluate", str(built), option, str(tmp_path / "nowhere")], "nowhere", "; check"
+    )
 
 
 def test_given_ground_truth_of_training_views_only_is_refused(built, tiny_capture, tmp_path, capsys):
