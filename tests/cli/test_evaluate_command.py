@@ -1,6 +1,8 @@
 """``lexsplat evaluate`` and ``lexsplat info``."""
 
+import errno
 import json
+import os
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
@@ -50,7 +52,9 @@ def test_info_states_the_method_and_its_codes(built, capsys):
 
 @pytest.mark.parametrize("option", ["--ground-truth", "--masks"])
 def test_ground_truth_that_is_given_and_missing_ends_in_one_line(option, built, tmp_path, capsys):
-    fails_in_one_line(capsys, ["evaluate", str(built), option, str(tmp_path / "nowhere")], "nowhere")
+    fails_in_one_line(
+        capsys, ["evaluate", str(built), option, str(tmp_path / "nowhere")], "nowhere", "; check"
+    )
 
 
 def test_given_ground_truth_of_training_views_only_is_refused(built, tiny_capture, tmp_path, capsys):
@@ -62,6 +66,15 @@ def test_given_ground_truth_of_training_views_only_is_refused(built, tiny_captur
     fails_in_one_line(
         capsys, ["evaluate", str(built), "--ground-truth", str(given)], "given", "held-out views"
     )
+
+
+def test_a_scene_folder_that_takes_no_file_is_refused_before_anything_is_measured(built, monkeypatch, capsys):
+    def refuse(dir):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), f"{dir}/tmp1")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("lexsplat.evaluation.scenes.evaluate", lambda *_, **__: pytest.fail("measured"))
+    fails_in_one_line(capsys, ["evaluate", str(built)], f"error: {built}: Read-only", "give another place")
 
 
 def test_a_scene_without_held_out_views_says_that_nothing_is_measured(built, tmp_path, caplog):

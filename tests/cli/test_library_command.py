@@ -98,6 +98,17 @@ def test_what_is_wrong_is_reported_in_one_line_with_its_remedy(rooms, capsys):
     assert document(capsys, "search", rooms, "mug")["phrases"][0]["skipped"][0]["scene"] == "kitchen"
 
 
+def test_the_commands_that_are_proposed_quote_paths_with_spaces(rooms, capsys):
+    library = shutil.copytree(rooms / "library", rooms / "my library")
+    shutil.rmtree(rooms / "office")
+    assert cli.main(["library", "verify", str(library)]) == 1
+    assert f"if it is gone: lexsplat library remove '{library}' office" in capsys.readouterr().out
+    (library / "library.json").unlink()
+    fails_in_one_line(
+        capsys, ["library", "list", str(library)], f"; lexsplat library verify '{library}' --repair writes"
+    )
+
+
 def test_one_of_several_scenes_that_cannot_be_added_stops_no_other(rooms, capsys):
     library = str(rooms / "library")
     arguments = ["library", "add", library, str(rooms / "nowhere"), str(rooms / "office")]

@@ -122,8 +122,18 @@ def test_file_names_outside_utf8_end_in_one_line(tmp_path, capsys):
     fails_in_one_line(capsys, ["build", str(capture), "--output", str(tmp_path / "out"), *QUICK], "UTF-8")
 
 
-@pytest.mark.parametrize("name", ["nowhere", "walk.mp4", "empty"])
-def test_poses_of_nothing_end_in_one_line_without_output(name, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("nowhere", "no such folder"),
+        ("walk.mp4", "no such file"),
+        ("empty", "found 0"),
+        ("notes.txt", "found a file"),
+    ],
+)
+def test_poses_of_nothing_end_in_one_line_without_output(name, found, tmp_path, capsys):
     (tmp_path / "empty").mkdir()
-    fails_in_one_line(capsys, ["poses", str(tmp_path / name), "--output", str(tmp_path / "out")], name)
+    (tmp_path / "notes.txt").write_text("no photo")
+    arguments = ["poses", str(tmp_path / name), "--output", str(tmp_path / "out")]
+    fails_in_one_line(capsys, arguments, f"{name}: expected", found)
     assert not (tmp_path / "out").exists()

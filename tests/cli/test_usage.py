@@ -36,6 +36,7 @@ from lexsplat.pipeline.config import BuildConfig
         ["query", "x", "apple", "--threshold", "nan"],
         ["query", "x", "apple", "--template", "no braces"],
         ["query", "x", "apple", "--temperature", "-1"],
+        ["query", "x", "apple", "--negatives", "thing", " "],
         ["build", "x", "--output", "y", "--seed", "-1"],
         ["build", "x", "--output", "y", "--seed", str(2**70)],
         ["build", "x", "--output", "y", "--reconstruction.max-gaussians", "0"],
@@ -342,6 +343,26 @@ def test_an_error_names_the_help_page_that_lists_every_option(wrong, columns, mo
     assert "All options: lexsplat build --help-all " in error
     assert "none)" not in error
     assert len(set(map(len, error.splitlines()))) == 1, "the panel keeps its frame"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [(["build"], "of masks/NAME.png are"), (["compare", "x"], "results. ablate with"),
+     (["build", "x", "--output", "y", "--codebook.num-codes", "many"], "found 'many'")],
+)  # fmt: skip
+def test_an_error_has_no_code_marks_and_its_panel_keeps_its_frame(arguments, told, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(arguments)
+    error = capsys.readouterr().err
+    assert told in " ".join(error.replace("│", " ").split())
+    assert "`" not in error
+    assert len(set(map(len, error.splitlines()))) == 1
+
+
+def test_an_empty_negative_is_named_as_one(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["query", "x", "apple", "--negatives", ""])
+    assert "negatives: expected words or phrases, found an empty text; name" in capsys.readouterr().err
 
 
 def test_reconstruct_accepts_the_options_of_build():

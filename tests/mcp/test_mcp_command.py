@@ -1,5 +1,7 @@
 """The command ``lexsplat mcp`` as clients start and leave it."""
 
+import json
+import signal
 import socket
 import subprocess
 import sys
@@ -35,6 +37,46 @@ def test_a_taken_port_and_a_foreign_address_end_in_one_line():
     assert foreign.returncode == 1
     assert len(foreign.stderr.splitlines()) == 1
     assert "host.invalid" in foreign.stderr
+
+
+INITIALIZE = {
+    "jsonrpc": "2.0",
+    "id": 1,
+    "method": "initialize",
+    "params": {
+        "protocolVersion": "2025-06-18",
+        "capabilities": {},
+        "clientInfo": {"name": "test", "version": "1"},
+    },
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("over", ["stdio", "http"])
+def test_ctrl_c_ends_a_server_in_order_though_its_client_stays(over):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    words = ["mcp", "demo", *(["--http", "--port", port] if over == "http" else [])]
+    # A job in the background is started with Ctrl-C ignored.
+    program = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"from lexsplat import cli; sys.exit(cli.main({words}))"
+    )
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=pipe, stdout=pipe, stderr=pipe, text=True
+    ) as server:
+        try:
+            if over == "stdio":
+                server.stdin.write(json.dumps(INITIALIZE) + "\n")
+                server.stdin.flush()
+            assert server.stdout.readline()
+            server.send_signal(signal.SIGINT)
+            assert server.wait(30) == 0
+            assert "stopped" not in server.stderr.read()
+        finally:
+            server.kill()
 
 
 def test_a_server_over_http_states_its_address(monkeypatch, capsys):

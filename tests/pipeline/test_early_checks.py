@@ -6,6 +6,7 @@ import errno
 import logging
 import os
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from support.refusals import assert_reports
 from support.written_captures import save
 
 from lexsplat.captures import load_capture
+from lexsplat.captures.readers.video import require_video
 from lexsplat.evaluation.demo import demo_capture
 from lexsplat.pipeline import build as pipeline
 from lexsplat.pipeline.build import build
@@ -124,6 +126,17 @@ def test_files_that_are_no_splats_are_refused_before_an_encoder_is_loaded(name, 
 def test_a_video_that_is_missing_is_reported_before_an_encoder_is_loaded(tmp_path, monkeypatch):
     monkeypatch.setattr("lexsplat.pipeline.build.check_encoders", lambda *_, **__: pytest.fail("too late"))
     refused(tmp_path / "walk.mp4", tmp_path / "out", "walk.mp4: expected a video, found no such file")
+
+
+def test_a_missing_reader_of_videos_is_reported_before_an_encoder_is_loaded(tmp_path, monkeypatch):
+    (tmp_path / "walk.mp4").write_bytes(b"")
+    monkeypatch.setitem(sys.modules, "av", None)  # importing it fails
+    monkeypatch.setattr(pipeline, "fetch_clip", lambda _: pytest.fail("too late"))
+    refused(tmp_path / "walk.mp4", tmp_path / "out", "walk.mp4", "PyAV", "lexsplat[video]", kind=BackendError)
+    frames = tmp_path / "scene" / "poses" / "images"
+    frames.mkdir(parents=True)
+    (frames / "frames.json").write_text("{}")
+    require_video(tmp_path / "walk.mp4", frames)  # what is kept needs no reader
 
 
 def test_splats_of_another_place_are_refused_and_those_of_the_place_taken(tmp_path):

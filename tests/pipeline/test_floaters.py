@@ -15,7 +15,7 @@ from support.surfaces import on_table
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.pipeline.viewpoints import choosing, stage
+from lexsplat.pipeline.viewpoints import choosing, floaters, stage, surroundings
 from lexsplat.pipeline.viewpoints.floaters import find_floaters, isolation
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.ply import write_ply
@@ -35,6 +35,20 @@ def dusty() -> tuple[Gaussians, Gaussians]:
 def of_dust() -> np.ndarray:
     """The floaters that are found in `dusty`, whose up direction is given."""
     return find_floaters(joined(*dusty()), Path("dusty.ply"), up=UP)
+
+
+@pytest.mark.slow
+def test_up_is_estimated_once_for_all_searches(monkeypatch):
+    calls = []
+
+    def counting(name, function):
+        return lambda *given: [calls.append(name), function(*given)][1]
+
+    for module, name in ((surroundings, "find_upward"), (floaters, "_before_surfaces")):
+        monkeypatch.setattr(module, name, counting(name, getattr(module, name)))
+    find_floaters(joined(*dusty()), Path("dusty.ply"))
+    assert calls.count("_before_surfaces") > 1
+    assert calls.count("find_upward") == 1
 
 
 @pytest.mark.slow

@@ -62,13 +62,36 @@ def test_prompts_that_differ_in_other_characters_alone_do_not_overwrite_the_imag
 ):
     prompts = ["ball 0", "ball/0", "ball 0", "Ball 0?"]
     answers = answer_queries(scene, prompts, ["view0"], 0.4, tmp_path)["prompts"]
-    masks = [answer["views"][answer["peak_view"]]["mask"] for answer in answers]
-    assert [Path(mask).parent.name for mask in masks] == ["ball_0", "ball_0_2", "ball_0", "ball_0_3"]
+    folders = [Path(answer["views"][answer["peak_view"]]["mask"]).parent.name for answer in answers]
+    assert folders[0] == folders[2] == "ball_0"
+    assert len({name.lower() for name in folders}) == 3
+    assert folders == [file_name(prompt) for prompt in prompts]
 
 
 @pytest.mark.parametrize(
     ("prompt", "name"),
-    [("Red Apple!", "red_apple"), ("дом / сад", "дом_сад"), ("?!", "prompt"), ("a" * 99, "a" * 80)],
-)
-def test_a_prompt_makes_a_file_name_in_any_alphabet(prompt, name):
-    assert file_name(prompt) == name
+    [("red apple", "red_apple"), ("Red Apple!", "red_apple_"), ("дом сад", "дом_сад"), ("дом / сад", "дом_сад_"),
+     ("?!", "prompt_"), ("a" * 99, "a" * 80 + "_"), ("\ud800", "prompt_")],
+)  # fmt: skip
+def test_a_prompt_makes_a_file_name_in_any_alphabet_and_a_hash_where_that_is_not_all_of_it(prompt, name):
+    found = file_name(prompt)
+    assert found == name or (found.startswith(name) and len(found) == len(name) + 8 and name[-1] == "_")
+
+
+def test_prompts_that_differ_have_files_that_differ():
+    prompts = [
+        "mug",
+        "Mug",
+        "Mug!",
+        "mug?",
+        "MUG",
+        " mug",
+        "red mug",
+        "red_mug",
+        "red  mug",
+        "a" * 81,
+        "a" * 82,
+    ]
+    names = [file_name(prompt) for prompt in prompts]
+    assert len({name.lower() for name in names}) == len(prompts)
+    assert names == [file_name(prompt) for prompt in prompts]

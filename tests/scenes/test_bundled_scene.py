@@ -11,13 +11,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from support.encoder_folders import write_clip
 
 from lexsplat import cli, open_scene
 from lexsplat.captures.images.reading import read_mask
 from lexsplat.evaluation.demo import demo_capture
 from lexsplat.features.encoders import load_clip
+from lexsplat.features.hub import BUNDLED_ENCODERS
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.errors import ModelError, SceneFolderError
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.records import read_record
 from lexsplat.scenes.scene import Scene
@@ -54,6 +56,15 @@ def test_its_language_uses_the_bundled_encoder(demo):
 def test_the_earlier_name_of_the_bundled_encoder_means_it_everywhere():
     assert open_scene("demo", clip="embedded").clip == "bundled"
     assert BuildConfig(clip="embedded", dino="embedded").clip == "bundled"
+
+
+def test_an_encoder_that_is_given_is_checked_when_the_scene_is_opened_wherever_it_lies(tmp_path):
+    moved = shutil.copytree(BUNDLED_ENCODERS / "clip", tmp_path / "moved")
+    assert open_scene("demo", clip=str(moved)).ask("red apple").presences == ("yes",)
+    with pytest.raises(ModelError, match="expected the encoder that the scene was built with, found another"):
+        open_scene("demo", clip=str(write_clip(tmp_path / "other")))
+    with pytest.raises(ModelError, match="found no such folder"):
+        open_scene("demo", clip=str(tmp_path / "nowhere"))
 
 
 @pytest.mark.parametrize(

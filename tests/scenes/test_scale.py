@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from support.command_line import fails_in_one_line
 
 from lexsplat import cli, open_scene
 from lexsplat.geometry.boxes import gravity_up
@@ -73,6 +74,13 @@ def test_a_distance_can_be_given_between_two_phrases(old_demo_copy, capsys):
     assert world["meters_per_unit"] == pytest.approx(0.3 / measured)
     assert run("scale", old_demo_copy, "--distance", 0.08, "--height-of", "red apple") == 0
     assert stored(old_demo_copy)["meters_per_unit"] == pytest.approx(0.08 / found[0].size[2])
+
+
+def test_what_is_not_found_and_what_has_no_length_are_refused_with_a_remedy(old_demo_copy, capsys):
+    scale = ["scale", str(old_demo_copy), "--distance", "1m"]
+    fails_in_one_line(capsys, [*scale, "--height-of", "violin"], "violin: ", "found nothing; try other words")
+    same = ["--between", "red apple", "red apple"]
+    fails_in_one_line(capsys, [*scale, *same], "red apple and red apple: ", "found 0; ")
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from jsonschema import Draft202012Validator
 
 from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.errors import QueryError
-from lexsplat.scenes.answers import answer_queries
+from lexsplat.scenes.answers import answer_queries, find_phrase
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.scene import open_scene
 from lexsplat.scenes.serving import MAX_LINE, OpenScene, answer_line, json_line, lines_of
@@ -176,6 +176,28 @@ def test_a_query_of_words_that_the_encoder_does_not_know_is_unsure_at_most_as_in
     assert (unknown["present"], mug["present"], mug["note"]) == ("unsure", "yes", "")
 
 
+@pytest.mark.parametrize("prompt", ["xxxxxxx", "the third teddy bear", "mug", "is there a bicycle?"])
+@pytest.mark.parametrize("first", ["find", "ask"])
+def test_a_prompt_has_one_presence_whatever_asks_it_and_in_any_order(served_demo, prompt, first):
+    scene = served_demo.scene.with_content(served_demo.scene.gaussians, served_demo.scene.field)
+    asked = {
+        "find": lambda: scene.find(prompt).present,
+        "ask": lambda: scene.ask(prompt).presences[0],
+        "selection": lambda: scene.ask(prompt).selection(0).present,
+        "select": lambda: scene.select(prompt).present,
+        "given threshold": lambda: scene.select(prompt, 0.5).present,
+        "query": lambda: answer_queries(scene, prompt, ["view_033"], None, None)["prompts"][0]["present"],
+    }
+    order = sorted(asked, key=lambda name: name != first)
+    assert len({asked[name]() for name in order}) == 1
+
+
+def test_words_in_quotation_marks_have_no_grammar_that_could_make_them_unsure(served_demo):
+    scene = served_demo.scene
+    assert scene.find('"the third teddy bear"').present == "yes"
+    assert scene.ask("the third teddy bear").presences == ("unsure",)
+
+
 @pytest.mark.parametrize(
     ("phrase", "understood", "names"),
     [
@@ -265,9 +287,14 @@ def test_a_word_that_is_none_and_resembles_nothing_here_is_reported(served_demo,
 
 
 def test_a_threshold_that_nothing_reaches_is_reported_in_a_whole_sentence(served_demo):
+    best = float(served_demo.scene.ask("mug").scores.max())
     answer = answer_line(served_demo, '{"ask": "mug", "threshold": 1}')
     assert (answer["count"], answer["instances"]) == (0, [])
-    assert answer["sentence"] == 'Nothing reaches the threshold 1 for "mug".'
+    assert answer["note"] == f'nothing of "mug" reaches the threshold 1: the best score is {best:.4f}'
+    assert answer["sentence"] == f'None found for "mug". Note: {answer["note"]}.'
+    related = find_phrase(served_demo.scene, "mug on the violin", None, 1.0)
+    assert (related["present"], related["note"]) == ("no", answer["note"])
+    assert find_phrase(served_demo.scene, "mug", None, best)["note"] == ""
 
 
 @pytest.mark.slow

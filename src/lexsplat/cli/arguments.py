@@ -115,9 +115,14 @@ def _parsed(command: type[CommandT], program: str, words: Sequence[str]) -> Comm
         all_options = f"All options: {program} {whole}"
         text = re.sub(page, lambda found: all_options.ljust(len(found.group())), written.getvalue())
         text = re.sub(nothing, lambda found: re.sub(r"[^\s│]", " ", found.group()), text)
+        text = re.sub(r"(?m)^(.*`.*?)(\S*)$", _without_code_marks, text)
         if not sys.stderr.isatty():  # tyro asks standard output
             text = re.sub(r"\x1b\[[\d;]*m", "", text)
         print(text, end="", file=sys.stderr)
+
+
+def _without_code_marks(line: re.Match[str]) -> str:
+    return line[1].replace("`", "").ljust(len(line[1])) + line[2]
 
 
 def _in_our_spelling(word: str, synonyms: dict[str, str]) -> str:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib.util
+import os
+import signal
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -95,10 +98,13 @@ class Mcp:
         server = make_server(scenes, self.output.resolve() if self.allow_write else None, library)
         for served in scenes.values():  # meanwhile the client connects; the process ends after them
             threading.Thread(target=served.warm).start()
-        if listening is None:
-            server.run()
-        else:
+        if listening is not None:
             host = f"[{self.host}]" if ":" in self.host else self.host
             address = f"http://{host}:{listening.getsockname()[1]}/mcp"
-            print(f"{', '.join(self.scenes)} served at {address} (Ctrl-C stops the server)", flush=True)
-            serve_http(server, listening, self.host, self.token)
+            with contextlib.suppress(KeyboardInterrupt):  # the way to end a server, as of lexsplat view
+                print(f"{', '.join(self.scenes)} served at {address} (Ctrl-C stops the server)", flush=True)
+                serve_http(server, listening, self.host, self.token)
+            return
+        # Nothing else ends the thread that waits for the client's next line.
+        signal.signal(signal.SIGINT, lambda *_: os._exit(0))
+        server.run()

@@ -62,7 +62,7 @@ class Poses:
 
         photos, memory = self.photos, parse_bytes(self.memory)
         if is_video(photos):  # before --output is made
-            require_video(photos)
+            require_video(photos, self.output / "images")
         else:
             checked_photos(photo_folder(photos), self.output)
         with SceneFolder(self.output).locked(), ProgressBars() as bars:

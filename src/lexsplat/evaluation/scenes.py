@@ -18,7 +18,7 @@ from lexsplat.evaluation.report.tables import table_rows, write_rows
 from lexsplat.pipeline.inputs import reload_capture
 from lexsplat.runtime.environment import machine_facts
 from lexsplat.runtime.errors import CaptureError
-from lexsplat.runtime.files import atomic_path, read_json, write_json
+from lexsplat.runtime.files import atomic_path, read_json, require_writable, write_json
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.facts import is_of_chosen_views
@@ -59,12 +59,14 @@ def evaluate_scene(
         SceneFolderError: If the photos are missing, or the scene is the bundled one or being rebuilt.
         CaptureError: If a photo or a mask cannot be used, or ``masks`` or ``prompt_list`` is given and no held-out
             view has ground truth.
+        OSError: If the folder takes no file.
     """
     if scene.folder is None:
         raise ValueError("only a scene opened from a folder can be evaluated")
     folder, record = scene.folder, scene.folder.record
     require_current(folder)
     folder.refuse_bundled()
+    require_writable(folder.root)
     photos = reload_capture(folder, capture)
     if not photos.test_names:
         log.warning(

@@ -16,6 +16,7 @@ import time
 from collections.abc import Collection, Iterable, Iterator
 from difflib import get_close_matches
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from lexsplat.features.weights import INDEX, WEIGHTS, first_weights, weight_files
@@ -216,7 +217,7 @@ def _path_of_hash(files: Iterable[Path]) -> Path | None:
 def _check_readable(path: Path, mode: int = os.R_OK) -> None:
     """Refuse a file or folder without permission."""
     if not os.access(path, mode):
-        remedy = f"allow it: chmod u+r{'x' if mode & os.X_OK else ''} {path}"
+        remedy = f"allow it: chmod u+r{'x' if mode & os.X_OK else ''} {quote(str(path))}"
         raise ModelError(path, expected="permission to read it", found="none", remedy=remedy)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lexsplat.features.hub import model_folder
 from lexsplat.runtime.environment import user_cache
-from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.errors import FileFormatError, ModelError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -54,6 +54,21 @@ def load_text(name: str, device: torch.device | str = "cpu") -> TextTower:
     from lexsplat.features.encoders import load_clip
 
     return load_clip(name, device)
+
+
+def check_encoder(name: str, content_hash: str, needed: str | None) -> None:
+    """Refuse an encoder whose hash is not the one of the features; None as ``needed`` knows of none.
+
+    Raises:
+        ModelError: It is another one.
+    """
+    if needed not in (None, content_hash):
+        raise ModelError(
+            name,
+            expected="the encoder that the scene was built with",
+            found="another one",
+            remedy="give the right one with --clip, or build the scene again with this one",
+        )
 
 
 def encode_each(encoder: TextTower, texts: Sequence[str], listener: Listener = silent) -> Tensor:

@@ -38,6 +38,7 @@ from lexsplat.rendering.backends import require_gsplat
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.device import choose_device, choose_encoder_device
 from lexsplat.runtime.errors import (
+    BackendError,
     CaptureError,
     FileFormatError,
     MemoryBudgetError,
@@ -128,7 +129,7 @@ def build(
             SharedFolder.forget_marks(folder.root / "checkpoints")
             workers.require((capture.root,))
             return builder.run(until)
-        except (CaptureError, FileFormatError, ModelError, MemoryBudgetError, OSError):
+        except (BackendError, CaptureError, FileFormatError, ModelError, MemoryBudgetError, OSError):
             if is_new:  # the lock is held, so nobody else uses the folder
                 folder.withdraw(above)
             raise

@@ -73,7 +73,7 @@ def prepare_capture(
         folder.record.pop("images", None)
         return load_capture(source, test_every=config.test_every, test_names=test_names)
     poses = folder.root / "poses"
-    photos = poses / "images" if is_video(source) else photo_folder(source)
+    photos = _frames_folder(folder.root) if is_video(source) else photo_folder(source)
     if folder.root.resolve() in (photos.resolve(), source.resolve()):
         raise CaptureError(
             folder.root,
@@ -91,6 +91,11 @@ def prepare_capture(
         test_every=config.test_every,
         test_names=test_names,
     )
+
+
+def _frames_folder(output: Path) -> Path:
+    """Where the frames of a video are, in a scene folder."""
+    return output / "poses" / "images"
 
 
 @dataclass(frozen=True)
@@ -153,6 +158,7 @@ def survey_photos(
     Masks are checked by structure from motion before it searches features.
 
     Raises:
+        BackendError: If a video cannot be read here.
         CaptureError: As `preview_capture`, if there is neither a camera, a photo nor a video, or if ground truth
             belongs to no photo or does not fit it.
         FileFormatError: If features of another program or 2D segments do not fit the photos.
@@ -163,7 +169,7 @@ def survey_photos(
         return None
     capture = preview_capture(source, output, config, test_names)
     if capture is None:
-        require_video(source)
+        require_video(source, _frames_folder(output))
         return PhotoSurvey(config.frames, _VIDEO_SIZE)
     load_annotations(capture)
     check_given_maps(config, capture)

@@ -7,7 +7,9 @@ names are among its members. Only everyday kinds with everyday members are here;
 
 from __future__ import annotations
 
-from lexsplat.queries.phrases import Phrase, things_of
+from dataclasses import replace
+
+from lexsplat.queries.phrases import Phrase, Understood, things_of
 from lexsplat.queries.spelling import strange
 from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary, words
 
@@ -61,6 +63,14 @@ def unknown_note(phrase: Phrase, clip: str) -> str:
         return ""
     listed = ", ".join(f'"{word[:_SHOWN]}"' for word in unknown[:3])
     return f"the bundled encoder knows English words alone, not {listed}"
+
+
+def with_unknown_words(understood: Understood, clip: str) -> Understood:
+    """A parsed phrase with the note of `unknown_note`; it is ``unknown`` if there is one."""
+    note = unknown_note(understood.phrase, clip)
+    if not note:
+        return understood
+    return replace(understood, note="; ".join(filter(None, (understood.note, note))), unknown=True)
 
 
 def _kind(text: str) -> str:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Union
+from typing import TYPE_CHECKING, Any, Literal, Union
+
+if TYPE_CHECKING:
+    from lexsplat.queries.selection import Presence
 
 RelationName = Literal[
     "left of", "right of", "in front of", "behind", "on", "under", "above", "below", "inside", "next to",
@@ -214,6 +217,10 @@ class Understood:
     phrase: Phrase
     note: str = ""
     unknown: bool = False
+
+    def limit(self, present: Presence) -> Presence:
+        """The presence of its answer: "unsure" at most where nothing is certainly here."""
+        return "unsure" if self.unknown and present == "yes" else present
 
 
 def numbered(phrase: Phrase, count: int, rank: int) -> Phrase | None:

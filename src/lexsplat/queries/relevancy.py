@@ -81,6 +81,9 @@ class QueryConfig:
         for template in self.templates:
             if template.count("{}") != 1:
                 raise ValueError(f"a template must contain {{}} exactly once, got {template!r}")
+        for flaw in filter(None, map(_flaw, self.negatives)):
+            remedy = 'name something, such as "object"'
+            raise ValueError(f"negatives: expected words or phrases, found {flaw}; {remedy}")
         if not 0 <= self.threshold <= 1:
             raise ValueError(f"threshold must be in 0..1, got {self.threshold}")
 
@@ -155,16 +158,22 @@ def check_prompts(prompts: str | Sequence[str]) -> list[str]:
             remedy='name something, such as "red apple"',
         )
     for number, prompt in enumerate(cleaned, start=1):
-        # Bytes of the command line that are not UTF-8 arrive as lone surrogates.
-        is_text = prompt.encode("utf-8", "ignore").decode("utf-8") == prompt
-        if not prompt or not is_text:
+        if flaw := _flaw(prompt):
             raise QueryError(
                 f"prompt {number} of {len(cleaned)}",
                 expected="a word or phrase",
-                found="bytes that are not UTF-8" if prompt else "an empty text",
+                found=flaw,
                 remedy='name something, such as "red apple"',
             )
     return cleaned
+
+
+def _flaw(text: str) -> str:
+    """What a text is if it is no word or phrase; "" if it is one."""
+    if not text.strip():
+        return "an empty text"
+    # Bytes of the command line that are not UTF-8 arrive as lone surrogates.
+    return "" if text.encode("utf-8", "ignore").decode("utf-8") == text else "bytes that are not UTF-8"
 
 
 def check_phrase(phrase: str) -> str:

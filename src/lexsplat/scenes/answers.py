@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +16,9 @@ from torch import Tensor
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.grammar import understand, undetermined
 from lexsplat.queries.heatmaps import overlay_heatmap
-from lexsplat.queries.kinds import is_kind, is_of_kind, unknown_note
+from lexsplat.queries.kinds import is_kind, is_of_kind, with_unknown_words
 from lexsplat.queries.parts import FEWEST, part_scores, with_parts
+from lexsplat.queries.phrases import Thing, Understood
 from lexsplat.queries.relevancy import check_prompts, render_relevancy
 from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
@@ -44,7 +45,7 @@ class Word:
     Args:
         scores: Relevancy of every Gaussian ``[N]`` in 0..1, in the form of the query.
         own: The same for each Gaussian by itself ``[N]``.
-        presence: Whether the scene holds it.
+        presence: Whether the scene holds it, as if its words were known.
         threshold: The automatic threshold; None until it is asked for.
         selection: The selection of that threshold; None until it is asked for.
     """
@@ -98,9 +99,9 @@ class Answers:
             raise QueryError("answer", expected=f"a number from 0 to {len(self) - 1}", found=repr(index)[:40])
         if not self.words:
             return self._selection(index)
-        word = self.words[index]
-        word.selection = word.selection or self._selection(index)
-        return word.selection
+        word, present = self.words[index], self.presences[index]
+        made = word.selection = word.selection or self._selection(index)
+        return made if made.present == present else made.described(present=present)
 
     def chosen(self, index: int) -> Tensor:
         """The Gaussians ``[N]`` bool that reach the threshold of a prompt and can be seen."""
@@ -214,7 +215,7 @@ def answer_queries(
     """
     names = [scene.view(name).name for name in views] or default_views(scene)
     found = scene.ask(prompts, threshold)
-    thresholds, folders = found.thresholds.tolist(), file_names(found.prompts)
+    thresholds = found.thresholds.tolist()
     answers: list[dict[str, Any]] = [
         {
             "prompt": prompt,
@@ -222,7 +223,8 @@ def answer_queries(
             "peak": 0.0,
             "peak_view": names[0],
             "gaussians": len(found.selection(number)),
-            **_present_and_note(scene, prompt, present),
+            "present": present,
+            "note": in_own_words(prompt, scene.clip).note,
             "views": {},
         }
         for number, (prompt, limit, present) in enumerate(zip(found.prompts, thresholds, found.presences))
@@ -233,7 +235,7 @@ def answer_queries(
         relevancy = scene.relevancy(found.prompts, name).cpu().numpy()
         for answer, limit, values in zip(answers, thresholds, relevancy):
             answer["views"][name] = _write_images(
-                folder and folder / folders[answer["prompt"]], name, image, values, limit
+                folder and folder / file_name(answer["prompt"]), name, image, values, limit
             )
             if values.max() > answer["peak"]:
                 answer["peak"], answer["peak_view"] = float(values.max()), name
@@ -246,21 +248,19 @@ def answer_queries(
     }
 
 
-def _present_and_note(scene: Scene, prompt: str, present: Presence) -> dict[str, str]:
-    """Presence and note of a prompt that is asked in its own words; "unsure" at most for words that are not known.
+def in_own_words(prompt: str, clip: str) -> Understood:
+    """What is known of a prompt that is asked in its own words.
 
     The note says what to ask in place of a question or a phrase with grammar.
     """
-    note = ""
-    with contextlib.suppress(QueryError):
+    try:
         parsed = understand(prompt)
-        unknown = unknown_note(parsed.phrase, scene.clip)
-        if parsed.unknown or unknown:
-            note = "; ".join(filter(None, (parsed.note, unknown)))
-            present = "unsure" if present == "yes" else present
-        elif str(parsed.phrase).lower() != f'"{singular(undetermined(prompt.strip())).lower()}"':
-            note = f"asked in these words; lexsplat find understands {parsed.phrase}"
-    return {"present": present, "note": note}
+    except QueryError:
+        return Understood(Thing(prompt))
+    parsed = with_unknown_words(parsed, clip)
+    if parsed.unknown or str(parsed.phrase).lower() == f'"{singular(undetermined(prompt.strip())).lower()}"':
+        return parsed if parsed.unknown else replace(parsed, note="")
+    return replace(parsed, note=f"asked in these words; lexsplat find understands {parsed.phrase}")
 
 
 def rests_on(scene: Scene) -> str:
@@ -346,19 +346,15 @@ def _write_images(
 
 
 def file_name(prompt: str) -> str:
-    """A file name for a prompt: its letters and digits, of any alphabet, joined by underscores."""
-    return re.sub(r"\W+", "_", prompt.lower()).strip("_")[:80] or "prompt"
+    """A file name of its own for a prompt: its letters and digits, of any alphabet, joined by underscores.
 
-
-def file_names(prompts: Sequence[str]) -> dict[str, str]:
-    """File names by prompt; of prompts that differ in other characters alone, the later ones are numbered."""
-    names: dict[str, str] = {}
-    for prompt in dict.fromkeys(prompts):
-        numbered = (
-            f"{file_name(prompt)}{end}" for end in ("", *(f"_{n}" for n in range(2, len(prompts) + 1)))
-        )
-        names[prompt] = next(name for name in numbered if name not in names.values())
-    return names
+    Where these do not tell the prompt from others, such as "Mug!" from "mug", a hash of the prompt follows.
+    """
+    name = re.sub(r"\W+", "_", prompt.lower()).strip("_")[:80]
+    if name.replace("_", " ") == prompt:
+        return name
+    own = hashlib.blake2b(prompt.encode("utf-8", "surrogatepass"), digest_size=4).hexdigest()
+    return f"{name or 'prompt'}_{own}"
 
 
 def _to_uint8(image: torch.Tensor) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ import torch
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.answering import Searched, answer
 from lexsplat.queries.grammar import understand
-from lexsplat.queries.kinds import unknown_note, words_of_things
+from lexsplat.queries.kinds import with_unknown_words, words_of_things
 from lexsplat.queries.phrases import Phrase, Thing, Understood, mended_note, things_of, with_things
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.spelling import spellings
@@ -19,6 +20,7 @@ from lexsplat.queries.wording import thing_of
 from lexsplat.scenes.objects import object_colors
 
 if TYPE_CHECKING:
+    from lexsplat.scenes.answers import Answers
     from lexsplat.scenes.scene import Scene
 
 _SHORT = 60
@@ -50,9 +52,8 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
         return thing
 
     found = with_things(understood.phrase, mend)
-    notes = [*filter(None, (understood.note, mended_note(mended)))]
-    unknown = unknown_note(found, scene.clip)
-    return Understood(found, "; ".join(filter(None, (*notes, unknown))), unknown=bool(unknown))
+    note = "; ".join(filter(None, (understood.note, mended_note(mended))))
+    return with_unknown_words(Understood(found, note), scene.clip)
 
 
 def _tokens_over(scene: Scene, text: str) -> int:
@@ -72,14 +73,16 @@ def find_in(
         understood: The phrase.
         camera: Where "left" and "me" refer to; None lets the views decide that show both things
             (`lexsplat.queries.viewers`), and takes the camera in the middle of all for "me".
-        threshold: See `Scene.select`. With an automatic threshold, an answer "no" has no Gaussians.
+        threshold: See `Scene.select`. With an automatic threshold, an answer "no" has no Gaussians. The note names
+            the things that do not reach a given one.
     """
     things = things_of(understood.phrase)
-    answers = scene.ask(things, threshold) if things else None
+    # A phrase is checked as a whole; words in quotation marks have no grammar.
+    answers = scene.ask(things, threshold, checked=True) if things else None
 
     def select(text: str) -> Selection:
         if answers is None or text not in things:
-            return scene.select(text, threshold)
+            return scene.ask(text, threshold, checked=True).selection(0)
         return answers.selection(things.index(text))
 
     def viewer(reference: Selection | None) -> Camera | None:
@@ -87,11 +90,20 @@ def find_in(
 
     searched = Searched(select, viewer, lambda: scene.objects, lambda thing: object_colors(scene, thing))
     found = answer(understood.phrase, searched)
-    if understood.unknown and found.present == "yes":
-        found = found.described(present="unsure")
+    if (present := understood.limit(found.present)) != found.present:
+        found = found.described(present=present)
+    if answers is not None and threshold is not None:
+        found = found.described(note="; ".join(filter(None, (found.note, *_too_low(answers, threshold)))))
     if found.present == "no" and threshold is None:
         return replace(found, mask=torch.zeros_like(found.mask), parts=())
     return found
+
+
+def _too_low(answers: Answers, threshold: float) -> Iterator[str]:
+    """A note on each thing in the scene whose scores are all below a threshold."""
+    for thing, present, best in zip(answers.prompts, answers.presences, answers.scores.amax(1).tolist()):
+        if present != "no" and best < threshold:
+            yield f'nothing of "{thing}" reaches the threshold {threshold:g}: the best score is {best:.4f}'
 
 
 def middle_camera(scene: Scene) -> Camera | None:

@@ -30,7 +30,7 @@ from lexsplat.captures.images.undistortion import MAX_SIDE
 from lexsplat.captures.readers.camera_files import MAX_COORDINATE, checked_name
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.runtime.errors import FileFormatError, SceneFolderError
+from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path, locked, read_json, to_json, write_json
 from lexsplat.scenes.records import FORMAT_VERSION, read_record
 
@@ -48,6 +48,29 @@ class StoredView:
     name: str
     camera: Camera
     split: str
+
+
+def view_named(views: Mapping[str, StoredView], name: str) -> StoredView:
+    """The view called ``name``, with or without its suffix.
+
+    Raises:
+        QueryError: If there is none, or several match.
+    """
+    if not isinstance(name, str):
+        expected = "the name of a view, a StoredView or a Camera"
+        raise QueryError("view", expected=expected, found=repr(name)[:60])
+    if name in views:
+        return views[name]
+    matches = [view for key, view in views.items() if Path(key).stem == Path(name).stem]
+    if len(matches) != 1:
+        known = ", ".join(list(views)[:5])
+        raise QueryError(
+            f"view {name[:60]!r}",
+            expected="the name of a view",
+            found="no match" if not matches else f"{len(matches)} matches",
+            remedy=f"the scene has {len(views)} views, such as {known}",
+        )
+    return matches[0]
 
 
 def _stored_view(entry: Any, path: Path) -> StoredView:

@@ -192,7 +192,7 @@ def _named(thing: Selection, words: Sequence[str], strengths: np.ndarray) -> Sel
 
 def _named_by_words(scene: Scene, words: Sequence[str]) -> tuple[Selection, ...]:
     """The objects of a scene without segments: the instances of all words, each place under its best word."""
-    answers = scene.ask(words)
+    answers = scene.ask(words, checked=True)
     found = [
         instance
         for number, presence in enumerate(answers.presences)

@@ -42,7 +42,8 @@ def the_thing(scene: Scene, phrase: str) -> Selection:
     """
     found = scene.find(phrase)
     if not found:
-        raise QueryError(phrase, expected="something in the scene", found="nothing")
+        remedy = "try other words; lexsplat list names what is in the scene"
+        raise QueryError(phrase, expected="something in the scene", found="nothing", remedy=remedy)
     if found.present != "yes":
         log.warning("%s: perhaps not in this scene; check with: lexsplat find", phrase)
     if len(found.instances) > 1:
@@ -88,5 +89,6 @@ def positive_length(length: float, subject: str) -> float:
         QueryError: If it is not positive.
     """
     if not length > 0:
-        raise QueryError(subject, expected="a positive distance", found=f"{length:g}")
+        remedy = "measure something with an extent, or between two different places"
+        raise QueryError(subject, expected="a positive distance", found=f"{length:g}", remedy=remedy)
     return length

@@ -17,8 +17,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lexsplat.features.hub import present_name
-from lexsplat.features.text import TextCache, TextTower, encode_each, load_text, texts_of_scene
+from lexsplat.features.hub import content_hash, model_folder, present_name
+from lexsplat.features.text import TextCache, TextTower, check_encoder, encode_each, load_text, texts_of_scene
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
@@ -44,11 +44,11 @@ from lexsplat.queries.thresholds import check_threshold
 from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
-from lexsplat.runtime.errors import ModelError, QueryError, SceneFolderError
+from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.progress import Listener, silent
-from lexsplat.scenes.answers import Answers, Word, automatic_thresholds, of_kind, of_part
+from lexsplat.scenes.answers import Answers, Word, automatic_thresholds, in_own_words, of_kind, of_part
 from lexsplat.scenes.finding import find_in, understood_in
-from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder, StoredView
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder, StoredView, view_named
 from lexsplat.scenes.kept import kept_objects_of, seen_of
 from lexsplat.scenes.kept_objects import KeptObjects
 from lexsplat.scenes.objects import objects_of
@@ -182,13 +182,7 @@ class Scene:
         """
         if self.text_tower is None:
             self.text_tower = load_text(self.clip, str(self.gaussians.device))
-        if self._encoder_hash not in (None, self.text_tower.content_hash):
-            raise ModelError(
-                self.clip,
-                expected="the encoder that the scene was built with",
-                found="another one",
-                remedy="give the right one with --clip, or build the scene again with this one",
-            )
+        check_encoder(self.clip, self.text_tower.content_hash, self._encoder_hash)
         return self.text_tower
 
     def question(self, prompts: str | Sequence[str]) -> Question:
@@ -208,13 +202,18 @@ class Scene:
 
     # -- answers
 
-    def ask(self, prompts: str | Sequence[str], threshold: float | None = None) -> Answers:
+    def ask(
+        self, prompts: str | Sequence[str], threshold: float | None = None, *, checked: bool = False
+    ) -> Answers:
         """Scores, threshold and presence of each prompt; every mask and selection of the scene reads them.
+
+        A prompt with words that are not understood, or that the encoder does not know, is "unsure" at most.
 
         Args:
             prompts: What to look for.
             threshold: Smallest score of a selected Gaussian, in 0..1; None derives one for each prompt from the
                 training views (`lexsplat.queries.thresholds.scene_thresholds`).
+            checked: Whether the prompts are names of things, whose words are not checked (again).
 
         Raises:
             QueryError: If there is no prompt, one is empty, or the threshold is not in 0..1.
@@ -230,6 +229,8 @@ class Scene:
                 found.update((p, words_of.put(p, word)) for p, word in zip(new, self._new_words(new)))
         words = [word for prompt in prompts if (word := found[prompt]) is not None]
         presences = tuple(word.presence for word in words)
+        if not checked:
+            presences = tuple(map(Understood.limit, (in_own_words(p, self.clip) for p in prompts), presences))
         scores = torch.stack([word.scores for word in words])
         if given is not None:
             limits = torch.full((len(words),), given)
@@ -402,26 +403,12 @@ class Scene:
         return view.camera if isinstance(view, StoredView) else self.view(view).camera
 
     def view(self, name: str) -> StoredView:
-        """The view called ``name``, with or without its suffix.
+        """The view called ``name`` (`lexsplat.scenes.folder.view_named`).
 
         Raises:
             QueryError: If there is none, or several match.
         """
-        if not isinstance(name, str):
-            expected = "the name of a view, a StoredView or a Camera"
-            raise QueryError("view", expected=expected, found=repr(name)[:60])
-        if name in self.views:
-            return self.views[name]
-        matches = [view for key, view in self.views.items() if Path(key).stem == Path(name).stem]
-        if len(matches) != 1:
-            known = ", ".join(list(self.views)[:5])
-            raise QueryError(
-                f"view {name[:60]!r}",
-                expected="the name of a view",
-                found="no match" if not matches else f"{len(matches)} matches",
-                remedy=f"the scene has {len(self.views)} views, such as {known}",
-            )
-        return matches[0]
+        return view_named(self.views, name)
 
 
 def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = None) -> Scene:
@@ -430,10 +417,11 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
     Args:
         path: A folder made by ``lexsplat build`` or ``lexsplat demo``, or the word ``demo`` for the bundled scene.
         device: "auto", "cpu" or "cuda".
-        clip: Name or folder of the text encoder, if it is not where the build found it.
+        clip: Name or folder of the text encoder, if it is not where the build found it; it is checked at once.
 
     Raises:
         SceneFolderError: If the folder is not a finished scene.
+        ModelError: If ``clip`` cannot be found, or is not the encoder of the build.
         FileFormatError: If one of its files is damaged.
         BackendError: If "cuda" is asked for and there is no CUDA device.
         ValueError: If the device is not one of the three.
@@ -444,5 +432,9 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
             repr(path)[:60], expected="the path of a scene folder", found=type(path).__name__
         )
     found = read_scene(Path(path), place)
-    clip = clip or found.folder.record.get("config", {}).get("clip", "bundled")
-    return Scene(found.gaussians, found.field, found.views, clip, found.query, found.folder)
+    built_with = present_name(found.folder.record.get("config", {}).get("clip", "bundled"))
+    scene = Scene(found.gaussians, found.field, found.views, clip or built_with, found.query, found.folder)
+    needed = scene.encoder_identity().get("encoder_hash")
+    if needed and scene.clip != built_with:  # known words would be answered without the encoder
+        check_encoder(scene.clip, content_hash(model_folder(scene.clip, "clip"), "clip"), needed)
+    return scene

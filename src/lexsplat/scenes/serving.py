@@ -120,7 +120,7 @@ def sentence(answer: Mapping[str, Any], meters_per_unit: float | None = None) ->
     if answer["present"] == "no":
         text = f"Not here: nothing fits {understood}."
     elif not answer["instances"]:
-        text = f"Nothing reaches the threshold {answer['threshold']:g} for {understood}."
+        text = f"None found for {understood}."  # the note says why
     else:
         things = "; ".join(placed(thing, meters_per_unit) for thing in answer["instances"][:8])
         more = f"; and {answer['count'] - 8} more" if answer["count"] > 8 else ""

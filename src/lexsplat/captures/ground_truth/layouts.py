@@ -122,7 +122,9 @@ def check_ground_truth_options(root: Path, folder: Path | None, prompt_list: Pro
         CaptureError: If ``folder`` does not exist, or the capture has no prompt lists.
     """
     if folder is not None and not folder.is_dir():
-        raise CaptureError(folder, expected="a folder with masks or labels", found="no such folder")
+        found = "a file" if folder.exists() else "no such folder"
+        expected, remedy = "a folder with masks or labels", "check the path of --ground-truth"
+        raise CaptureError(folder, expected=expected, found=found, remedy=remedy)
     if prompt_list is not None:
         capture_prompt_names(root, prompt_list)
 

@@ -62,14 +62,30 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
 
 
-def require_video(video: Path) -> None:
-    """Refuse a path without a file.
+def require_video(video: Path, folder: Path) -> None:
+    """Refuse a video that cannot be sampled into a folder, before anything takes time.
 
     Raises:
-        CaptureError: If there is none.
+        BackendError: If PyAV is not installed and the folder holds no frames.
+        CaptureError: If there is no such file.
     """
     if not video.is_file():
         raise CaptureError(video, expected="a video", found="no such file", remedy="check the path")
+    if not (folder / _MANIFEST).is_file():
+        _require_pyav(video)
+
+
+def _require_pyav(video: Path) -> Any:
+    try:
+        import av
+    except ImportError as error:
+        raise BackendError(
+            video,
+            expected="PyAV, which reads videos",
+            found="not installed",
+            remedy='pip install "lexsplat[video]", or give a folder of photos',
+        ) from error
+    return av
 
 
 def sample_video(
@@ -102,7 +118,7 @@ def sample_video(
     """
     if count < 3:
         raise ValueError(f"count must be at least 3, got {count}")
-    require_video(video)
+    require_video(video, folder)
     inputs = {"video": _identity(video), "count": count, "version": 1}
     kept = _written_before(folder, inputs)
     if kept is not None:
@@ -196,15 +212,7 @@ def _open(video: Path, memory: int) -> Iterator[tuple[Any, Iterator[Any]]]:
         BackendError: If PyAV is not installed.
         CaptureError: If it cannot be opened or decoded, also during iteration.
     """
-    try:
-        import av
-    except ImportError as error:
-        raise BackendError(
-            video,
-            expected="PyAV, which reads videos",
-            found="not installed",
-            remedy='pip install "lexsplat[video]", or give a folder of photos',
-        ) from error
+    av = _require_pyav(video)
     try:
         with av.open(str(video)) as container:
             if not container.streams.video:

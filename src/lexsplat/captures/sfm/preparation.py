@@ -166,7 +166,10 @@ def checked_photos(folder: Path, output: Path) -> list[str]:
     """
     if not folder.is_dir():
         raise CaptureError(
-            folder, expected="a folder of photos", found="no such folder", remedy="check the path"
+            folder,
+            expected="a folder of photos, or a video",
+            found="a file" if folder.exists() else "no such folder",
+            remedy="give a folder" if folder.exists() else "check the path",
         )
     names = find_photos(folder, output)
     if len(names) < 3:

@@ -22,7 +22,8 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.rotations import matrices_from_quaternions
 from lexsplat.pipeline.viewpoints.candidates import around
 from lexsplat.pipeline.viewpoints.looking import SMALL, draw_depth, look_from_above
-from lexsplat.pipeline.viewpoints.surroundings import find_surroundings
+from lexsplat.pipeline.viewpoints.surroundings import Surroundings, find_surroundings
+from lexsplat.pipeline.viewpoints.upward import UpwardDirections
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -81,10 +82,11 @@ def find_floaters(
     if float((alone > _CERTAIN).mean()) < _MANY:
         return np.zeros(0, np.int64)
     floating = alone > _ISOLATED
+    upward: UpwardDirections | None = None
     with contextlib.suppress(CaptureError):  # no surfaces: the choice of views refuses such splats
         for _ in range(_ROUNDS):
             kept = np.flatnonzero(~floating)
-            found = _before_surfaces(_select(gaussians, kept), up, seed, listener)
+            found, upward = _before_surfaces(_select(gaussians, kept), up, upward, seed, listener)
             floating[kept[found]] = True
             if not len(found):
                 break
@@ -120,9 +122,13 @@ def _middle_radii(gaussians: Gaussians) -> NDArray[np.float64]:
 
 
 def _before_surfaces(
-    gaussians: Gaussians, up: NDArray[np.float64] | None, seed: int, listener: Listener
-) -> NDArray[np.int64]:
-    """Indices of the large Gaussians that hang in front of surfaces, or engulf them.
+    gaussians: Gaussians,
+    up: NDArray[np.float64] | None,
+    upward: UpwardDirections | None,
+    seed: int,
+    listener: Listener,
+) -> tuple[NDArray[np.int64], UpwardDirections | None]:
+    """Indices of the large Gaussians that hang in front of surfaces, or engulf them, and the directions of up.
 
     Raises:
         CaptureError: If the other Gaussians form no surfaces.
@@ -136,7 +142,9 @@ def _before_surfaces(
     points, radii = _spread(_select(gaussians, suspects)), _middle_radii(gaussians)[suspects]
     engulfing = own[suspects] < _ENGULFING
     before, on = (np.zeros(len(suspects), np.int64) for _ in range(2))
-    cameras = _cameras(_select(gaussians, solid), up, seed, generator)
+    shown = _select(gaussians, solid)
+    found = find_surroundings(shown, up, look_from_above(shown), Path(), seed, warn=False, upward=upward)
+    cameras = _cameras(found, generator)
     for done, camera in enumerate(cameras):
         listener(Event("floater views", done, len(cameras)))
         for part in np.unique(parts):
@@ -147,18 +155,15 @@ def _before_surfaces(
             on[members] += (np.abs(gaps) <= margins).sum(1)
     listener(Event("floater views", len(cameras), len(cameras)))
     least = np.where(engulfing, _PIERCED, _IN_FRONT)
-    return suspects[(before >= _LEAST) & (before >= least * (before + on))]
+    return suspects[(before >= _LEAST) & (before >= least * (before + on))], found.upward
 
 
 def _select(gaussians: Gaussians, indices: NDArray[np.int64]) -> Gaussians:
     return gaussians.select(torch.from_numpy(indices).to(gaussians.device))
 
 
-def _cameras(
-    solid: Gaussians, up: NDArray[np.float64] | None, seed: int, generator: np.random.Generator
-) -> list[Camera]:
-    """Views around the scene that the solid Gaussians form."""
-    found = find_surroundings(solid, up, look_from_above(solid), Path(), seed, warn=False)
+def _cameras(found: Surroundings, generator: np.random.Generator) -> list[Camera]:
+    """Views around a scene."""
     cameras = [camera for camera, _ in around(found, SMALL)]
     if len(cameras) > _VIEWS:
         chosen = generator.choice(len(cameras), _VIEWS, replace=False)

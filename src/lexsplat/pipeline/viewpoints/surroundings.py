@@ -69,6 +69,7 @@ class Surroundings:
         whole: The scene as a target.
         targets: Its parts.
         rivals: The same with other up directions that are nearly as likely, if up is a guess.
+        upward: The directions from which up was taken; None if it was given.
     """
 
     tree: cKDTree
@@ -79,6 +80,7 @@ class Surroundings:
     whole: Target
     targets: tuple[Target, ...]
     rivals: tuple[Surroundings, ...] = ()
+    upward: UpwardDirections | None = None
 
 
 def find_surroundings(
@@ -89,6 +91,7 @@ def find_surroundings(
     seed: int = 0,
     *,
     warn: bool = True,
+    upward: UpwardDirections | None = None,
 ) -> Surroundings:
     """Look at a sample of the Gaussians.
 
@@ -100,6 +103,7 @@ def find_surroundings(
         subject: The file, for errors.
         seed: Seed of the sample and of the targets.
         warn: Warn of an up direction that is a guess or seems wrong, and of a flat scene.
+        upward: The directions that may be up, if they are known from most of the Gaussians; None finds them.
 
     Raises:
         CaptureError: If fewer than `FEWEST` Gaussians are solid, all are at one point, or the scene is too small to
@@ -130,12 +134,12 @@ def find_surroundings(
     given = None if up is None else facing(Up(up / np.linalg.norm(up), True))
     if given is not None and not warn:
         return given
-    upward = find_upward(core, lambda direction: look(whole, direction))
+    upward = upward or find_upward(core, lambda direction: look(whole, direction))
     if warn:
         _warn(upward, up, points, subject)
     if given is not None:
         return given
-    estimated = facing(Up(upward.directions[0], upward.reliable))
+    estimated = replace(facing(Up(upward.directions[0], upward.reliable)), upward=upward)
     if upward.reliable:
         return estimated
     return replace(estimated, rivals=tuple(facing(Up(rival, False)) for rival in upward.rivals()))

@@ -12,7 +12,7 @@ from pathlib import Path
 from lexsplat.runtime.errors import FileFormatError, LibraryError
 from lexsplat.runtime.files import locked, read_json, write_json
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.scenes.library.records import has_entries
+from lexsplat.scenes.library.records import command, has_entries
 
 FORMAT_VERSION = 1
 _OWN = {"library.json", "scenes", "texts", "thumbnails"}
@@ -34,7 +34,7 @@ def library_name(root: Path) -> str:
             root,
             expected="a library of scenes",
             found="no library.json in it" if root.exists() else "no such folder",
-            remedy=_mending(root, f"make one with: lexsplat library add {root} SCENE"),
+            remedy=_mending(root, f"make one with: {command('add', root, 'SCENE')}"),
         )
     expected = f"format_version {FORMAT_VERSION} and a name"
     try:
@@ -143,9 +143,8 @@ def _damaged(root: Path, expected: str, found: str) -> _DamagedError:
 
 def _mending(root: Path, otherwise: str) -> str:
     """What repairs a lost or damaged ``library.json`` beside entries; another remedy where there are none."""
-    mending = (
-        f"lexsplat library verify {root} --repair writes it again; an index server has to be filled again"
-    )
+    repair = command("verify", root, "--repair")
+    mending = f"{repair} writes it again; an index server has to be filled again"
     return mending if has_entries(root) else otherwise
 
 

@@ -37,6 +37,7 @@ from lexsplat.scenes.library.records import (
     OWN_FILE,
     REMOVED,
     Record,
+    command,
     read_record,
     recovered_record,
     removals,
@@ -204,11 +205,10 @@ class Library:
 
     def _unusable(self, record: Record, error: LexsplatError) -> LexsplatError:
         """The error of a scene that cannot be read, with what can be done about its entry."""
-        remove = f"lexsplat library remove {self.root} {record.name}"
+        remove = command("remove", self.root, record.name)
+        remedy = f"if it was moved: {command('add', self.root, 'NEW_PLACE')}; if it is gone: {remove}"
         if (self.folder(record) / "scene.json").is_file():
             remedy = f"{error.remedy or 'build it again'}, or: {remove}"
-        else:
-            remedy = f"if it was moved: lexsplat library add {self.root} NEW_PLACE; if it is gone: {remove}"
         return type(error)(error.subject, expected=error.expected, found=error.found, remedy=remedy)
 
     def scene(self, name: str) -> Scene:

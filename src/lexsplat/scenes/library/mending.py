@@ -10,6 +10,7 @@ from lexsplat.runtime.progress import Event
 from lexsplat.scenes.library.contents import map_contents
 from lexsplat.scenes.library.records import (
     Record,
+    command,
     copy_of_record,
     damaged,
     recovered_record,
@@ -57,10 +58,10 @@ def orphans(library: Library) -> dict[str, str]:
     for name in sorted(scenes_without_record(library.stage)):
         problem = f"{library.stage / name}.json: expected the record of a scene, found files without one"
         if recovered_record(library.stage, name) is None:
-            found[name] = f"{problem}; add the scene again, or: lexsplat library remove {library.root} {name}"
+            found[name] = f"{problem}; add the scene again, or: {command('remove', library.root, name)}"
         else:
             why = "of an addition that was killed or is under way, or of a lost record"
-            found[name] = f"{problem}, {why}; lexsplat library verify {library.root} --repair"
+            found[name] = f"{problem}, {why}; {command('verify', library.root, '--repair')}"
     return found
 
 
@@ -81,7 +82,7 @@ def _problem(library: Library, name: str) -> str:
         problem = (
             f"{library.stage / name}.json: expected the record of a scene, found it and its copy damaged"
         )
-        return f"{problem}; lexsplat library remove {library.root} {name}, and add the scene again"
+        return f"{problem}; {command('remove', library.root, name)}, and add the scene again"
     if record is None or library.codes(record, by_hash=True) is None:
         return str(library.damaged.get(name, ""))  # "" if it was removed in the meantime
     path = library.stage / record.codes_file
@@ -98,7 +99,7 @@ def _problem(library: Library, name: str) -> str:
 def rebuilt(library: Library, record: Record) -> str:
     """What to do about a scene that was built again."""
     place = library.folder(record)
-    return f"{place}: rebuilt since it was added; lexsplat library add {library.root} {place}"
+    return f"{place}: rebuilt since it was added; {command('add', library.root, place)}"
 
 
 def _repair(library: Library, name: str) -> None:

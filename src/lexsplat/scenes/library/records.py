@@ -10,6 +10,7 @@ import dataclasses
 import json
 import os
 import re
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -236,5 +237,10 @@ def mapped_tensors(path: Path, expected: str) -> dict[str, Tensor]:
 
 def damaged(path: Path, expected: str, found: str) -> FileFormatError:
     """The error of a damaged file in the stage of a library, with what repairs it."""
-    remedy = f"lexsplat library verify {path.parents[1]} --repair"
+    remedy = command("verify", path.parents[1], "--repair")
     return FileFormatError(path, expected=expected, found=found, remedy=remedy)
+
+
+def command(action: str, library: Path, *words: object) -> str:
+    """A command that a message proposes, with quotation marks where a shell needs them."""
+    return shlex.join(["lexsplat", "library", action, str(library), *map(str, words)])

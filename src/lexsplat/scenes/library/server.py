@@ -30,7 +30,7 @@ from torch import Tensor
 from lexsplat.runtime.errors import BackendError, LibraryError
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.scenes.library.entries import Codes
-from lexsplat.scenes.library.records import Record
+from lexsplat.scenes.library.records import Record, command
 
 VERSION = "1."
 """First characters of the versions of the API that are understood."""
@@ -104,7 +104,7 @@ class Server:
         self.url, self._prefix = url.rstrip("/"), f"lexsplat-{library}-"
         self._client = httpx2.Client(timeout=httpx2.Timeout(ANSWER_SECONDS, connect=CONNECT_SECONDS))
         self._errors = (httpx2.ConnectError, httpx2.ConnectTimeout), httpx2.TimeoutException, httpx2.HTTPError
-        self._mending = f"lexsplat library verify {root} --repair --index {self.url}"
+        self._mending = command("verify", root, "--repair", "--index", self.url)
         self._known = False
 
     def check(self) -> None:
