@@ -110,35 +110,20 @@ class Answers:
     def _selection(self, index: int) -> Selection:
         scores = self.words[index].scores if self.words else self.scores[index]
         threshold = float(self.thresholds[index])
-        selection = Selection(
-            self.scene.gaussians,
-            self.scene.cameras,
-            scores >= threshold,
-            scores,
-            threshold,
-            self.presences[index],
-            self.prompts[index],
-            self.scene.world,
-            seen=self.scene.seen,
+        phrase, present = self.prompts[index], self.presences[index]
+        selection = self.scene.selection(
+            scores >= threshold, scores, threshold=threshold, present=present, phrase=phrase
         )
-        if self.prompts[index].lower().split()[-1] in STUFF:
+        if phrase.lower().split()[-1] in STUFF:
             seen = replace(selection, mask=self.chosen(index))
             return replace(seen, parts=(seen,)) if seen else seen
-        members = self._members(index)
-        if members:
+        if present == "yes" and (members := _members(self.scene, phrase)):
             known = (each.within(selection.mask) for each in members)
             return replace(selection, parts=tuple(each.described(scores=scores) for each in known if each))
         selection = selection.without_specks()
         if self.automatic:
             selection = selection.convincing(self.words[index].own if self.words else None)
         return without_hidden(selection, self.scene.hidden)
-
-    def _members(self, index: int) -> list[Selection]:
-        """The objects of the kind that a prompt names; none where it names no kind or is absent."""
-        prompt = self.prompts[index]
-        if self.presences[index] != "yes" or self.scene.query.fixed or not is_kind(prompt):
-            return []
-        return [each for each in self.scene.objects if is_of_kind(each.phrase, prompt)]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON: ``{"answers": [...]}``, each as `Selection.to_dict`."""
@@ -163,15 +148,20 @@ def automatic_thresholds(scene: Scene, words: Mapping[str, Word]) -> list[float]
 
 def of_kind(scene: Scene, prompt: str, word: Word) -> Word:
     """The word as it is, or with the objects of its kind ("toy") if the scene has any (`lexsplat.queries.kinds`)."""
-    if not is_kind(prompt) or scene.query.fixed:
-        return word
-    members = [each for each in scene.objects if is_of_kind(each.phrase, prompt)]
+    members = _members(scene, prompt)
     if not members:
         return word
     taken = torch.stack([each.mask for each in members]).any(0)
     # Members reach the border, and all others stay below it.
     inside, outside = word.scores.clamp(min=BORDER), word.scores.clamp(max=BORDER - 1e-4)
     return replace(word, scores=torch.where(taken, inside, outside), presence="yes")
+
+
+def _members(scene: Scene, prompt: str) -> list[Selection]:
+    """The objects of the kind that a prompt names; none where it names no kind."""
+    if scene.query.fixed or not is_kind(prompt):
+        return []
+    return [each for each in scene.objects if is_of_kind(each.phrase, prompt)]
 
 
 def of_part(scene: Scene, prompt: str, word: Word) -> Word:
@@ -231,7 +221,7 @@ def answer_queries(
     ]
     for done, name in enumerate(names):
         scene.listener(Event("views", done, len(names)))
-        image = _to_uint8(scene.render(name).image)
+        image = (scene.render(name).image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
         relevancy = scene.relevancy(found.prompts, name).cpu().numpy()
         for answer, limit, values in zip(answers, thresholds, relevancy):
             answer["views"][name] = _write_images(
@@ -355,7 +345,3 @@ def file_name(prompt: str) -> str:
         return name
     own = hashlib.blake2b(prompt.encode("utf-8", "surrogatepass"), digest_size=4).hexdigest()
     return f"{name or 'prompt'}_{own}"
-
-
-def _to_uint8(image: torch.Tensor) -> np.ndarray:
-    return (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()

@@ -19,7 +19,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.queries.selection import Selection
@@ -116,27 +115,24 @@ def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> 
 
 @dataclass(frozen=True)
 class Motion:
-    """A similarity transform of a selection: x -> scale R (x - center) + center + translation.
+    """A similarity transform of a selection about the center c of its box: x -> scale R (x - c) + c + translation.
 
     Args:
         translation: ``[3]``, world units.
         rotation: R ``[3, 3]``, a proper rotation; None is the identity.
         scale: Factor on sizes, positive.
-        center: Fixed point of rotation and scaling ``[3]``; None takes the center of the selection's box.
     """
 
     translation: Sequence[float] = (0.0, 0.0, 0.0)
     rotation: NDArray[np.float64] | None = None
     scale: float = 1.0
-    center: Sequence[float] | None = None
 
     def values(self, chosen: Selection) -> dict[str, Any]:
         """The numbers of a `Step` that moves ``chosen``."""
-        place: Any = chosen.center if chosen else np.zeros(3)
         vectors = {
             "rotation": np.eye(3) if self.rotation is None else self.rotation,
             "translation": self.translation,
-            "center": place if self.center is None else self.center,
+            "center": chosen.center if chosen else np.zeros(3),
         }
         numbers = {name: np.asarray(value, float).tolist() for name, value in vectors.items()}
         return {**numbers, "scale": float(self.scale)}
@@ -291,15 +287,13 @@ class Editor:
             )
         whole = self._whole(chosen, "fill" in values)
         if "fill" in values:
-            fill, mask = fill_for(whole, self._photographed_from(), self.original.listener)
+            cameras = [view.camera for view in self.original.views.values() if view.split == "train"]
+            fill, mask = fill_for(whole, cameras, self.original.listener)
             values, whole = {} if fill is None else {"fill": fill.to_json()}, replace(whole, mask=mask)
         step = Step(kind, whole.mask.clone().cpu(), values, chosen.phrase)
         with self._change(step.to_json()):
             self._advance(step)
             self.undone.clear()
-
-    def _photographed_from(self) -> list[Camera]:
-        return [view.camera for view in self.original.views.values() if view.split == "train"]
 
     @contextmanager
     def _change(self, entry: dict[str, Any]) -> Iterator[None]:

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,8 +50,7 @@ from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.answers import Answers, Word, automatic_thresholds, in_own_words, of_kind, of_part
 from lexsplat.scenes.finding import find_in, understood_in
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder, StoredView, view_named
-from lexsplat.scenes.kept import kept_objects_of, seen_of
-from lexsplat.scenes.kept_objects import KeptObjects
+from lexsplat.scenes.kept import KeptObjects, kept_objects_of, seen_of
 from lexsplat.scenes.objects import objects_of
 from lexsplat.scenes.reading import read_scene
 
@@ -238,7 +238,8 @@ class Scene:
         unknown = {prompt: word for prompt, word in zip(prompts, words) if word.threshold is None}
         if unknown:
             with self._working:
-                self._find_thresholds(unknown)
+                for word, limit in zip(unknown.values(), automatic_thresholds(self, unknown)):
+                    word.threshold = limit
         limits = torch.tensor([word.threshold for word in words])
         return Answers(tuple(prompts), scores, limits, presences, self, words=tuple(words))
 
@@ -319,6 +320,11 @@ class Scene:
                 self._objects = self._objects or (self.kept.objects if self.kept else objects_of(self))
         return self._objects
 
+    def selection(self, mask: Tensor, scores: Tensor, **facts: Any) -> Selection:
+        """A selection of its Gaussians; the arguments are those of `Selection`."""
+        facts = {"world": self.world, "seen": self.seen, **facts}
+        return Selection(self.gaussians, self.cameras, mask, scores, **facts)
+
     def click(self, view: str | StoredView | Camera, x: float, y: float) -> Selection:
         """The surface at a pixel, and what is connected to it and means the same.
 
@@ -365,11 +371,6 @@ class Scene:
         # Copies: a row would keep the scores of all prompts asked with it.
         words = [Word(row.clone(), own.clone(), here) for row, own, here in zip(formed, scores, presences)]
         return [of_part(self, p, of_kind(self, p, word)) for p, word in zip(prompts, words)]
-
-    def _find_thresholds(self, words: Mapping[str, Word]) -> None:
-        """The automatic thresholds of words that have none yet."""
-        for word, threshold in zip(words.values(), automatic_thresholds(self, words)):
-            word.threshold = threshold
 
     # -- views
 

@@ -11,6 +11,8 @@ import contextlib
 import json
 import logging
 import math
+import struct
+import zlib
 from collections.abc import Iterator
 from contextvars import ContextVar
 from dataclasses import replace
@@ -33,17 +35,28 @@ MOST_DROPPED = 0.1
 AROUND = 5
 """Cameras around a scene are at most this many times as far from its middle as the farthest Gaussian."""
 
-AGAIN = "copy the file again or export it again"
-"""The remedy for damage."""
+AGAIN, EXPORT_AGAIN = "copy the file again or export it again", "export the file again"
+"""The remedies for damage, and for content that copying cannot have changed."""
 
+_CAUSED: tuple[type[Exception], ...] = (
+    ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, OSError,
+    struct.error, zlib.error,
+)  # fmt: skip
 _logged: ContextVar[set[str] | None] = ContextVar("logged", default=None)
 _LARGEST_LOGIT = 20.0
 _COARSE = 0.1
 """Largest error of centers without a warning, as a share of the usual standard deviation."""
 _SMALLEST_LOG_SCALE = math.log(1e-12)
 _SMALLEST_QUAT = 1e-18  # squares of smaller ones are 0 in float32
+_SMALLER = np.array([(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])
+"""The three other components of a quaternion."""
 _ALWAYS_ALLOWED = 10_000
 _MOST_PER_BYTE = 8
+
+
+def damaged(path: Path, expected: str, found: str, remedy: str = AGAIN) -> FileFormatError:
+    """The error of a file with other content than expected."""
+    return FileFormatError(path, expected=expected, found=found, remedy=remedy)
 
 
 class Damage(ValueError):
@@ -64,6 +77,16 @@ def reason(error: Exception) -> str:
     elif isinstance(error, KeyError) and error.args:
         text = f"no {error.args[0]!r:.80}"
     return " ".join(f"damaged content{': ' if text else ''}{text}".split())[:240]
+
+
+@contextlib.contextmanager
+def parsing(path: Path, expected: str, *further: type[Exception]) -> Iterator[None]:
+    """Errors that damaged content causes in this block, and ``further`` ones, as errors of the file."""
+    caused = _CAUSED + further
+    try:
+        yield
+    except caused as error:
+        raise damaged(path, expected, reason(error)) from error
 
 
 @contextlib.contextmanager
@@ -111,7 +134,7 @@ def renderable(gaussians: Gaussians, path: Path) -> Gaussians:
     count = int((~valid).sum())
     if count > MOST_DROPPED * len(gaussians):
         found = f"{count:,} of {len(gaussians):,} Gaussians that cannot be rendered: {damage}"
-        raise FileFormatError(path, expected="finite numbers", found=found, remedy="export the file again")
+        raise damaged(path, "finite numbers", found, EXPORT_AGAIN)
     warn("%s: %d of %d Gaussians dropped: %s", path, count, len(gaussians), damage)
     return gaussians.select(valid)
 
@@ -164,11 +187,11 @@ def _check_sizes(gaussians: Gaussians, path: Path) -> None:
     zeros = (gaussians.log_scales < _SMALLEST_LOG_SCALE - 0.01).sum(1)  # 1e-12 itself may be rounded
     count, thin = int((zeros > 0).sum()), int((zeros > 1).sum())
     if thin > len(gaussians) / 2:
-        raise FileFormatError(
+        raise damaged(
             path,
-            expected="Gaussians with sizes",
-            found=f"{thin:,} of {len(gaussians):,} Gaussians with two or three sizes of 0",
-            remedy="export the file again",
+            "Gaussians with sizes",
+            f"{thin:,} of {len(gaussians):,} Gaussians with two or three sizes of 0",
+            EXPORT_AGAIN,
         )
     if count:
         warn("%s: %d of %d Gaussians have a size of 0, read as 1e-12", path, count, len(gaussians))
@@ -192,12 +215,7 @@ def check_count(path: Path, count: int, size: int) -> None:
         FileFormatError: If there are more than 8 Gaussians for each byte; few Gaussians are always allowed.
     """
     if count > max(_ALWAYS_ALLOWED, _MOST_PER_BYTE * size):
-        raise FileFormatError(
-            path,
-            expected=f"Gaussians that fit into {size:,} bytes",
-            found=f"a count of {count:,}",
-            remedy=AGAIN,
-        )
+        raise damaged(path, f"Gaussians that fit into {size:,} bytes", f"a count of {count:,}")
 
 
 def logits_of_bytes(opacities: NDArray[np.uint8]) -> Tensor:
@@ -209,6 +227,23 @@ def logits_of_bytes(opacities: NDArray[np.uint8]) -> Tensor:
     return values.clamp(0.25 / 255, 1 - 0.25 / 255).logit()
 
 
+def without_the_largest(quats: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """The three smaller components of unit quaternions ``[N, 3]``, and which one is left out ``[N]`` as positive."""
+    largest = np.abs(quats).argmax(1)
+    signs = np.where(quats[np.arange(len(quats)), largest] < 0, -1, 1)[:, None]
+    return np.take_along_axis(quats * signs, _SMALLER[largest], 1), largest
+
+
+def with_the_largest(small: NDArray[np.float64], largest: NDArray[np.integer]) -> NDArray[np.float64]:
+    """The inverse of `without_the_largest` ``[N, 4]``; zeros where ``largest`` is none of 0 to 3."""
+    quats = np.zeros((len(small), 4))
+    for left_out, kept in enumerate(_SMALLER):
+        rows = largest == left_out
+        quats[np.ix_(rows, kept)] = small[rows]
+        quats[rows, left_out] = np.sqrt(np.maximum(0, 1 - (small[rows] ** 2).sum(1)))
+    return quats
+
+
 def as_tensor(values: NDArray) -> Tensor:
     """A float32 tensor of its own memory; what is too large for it is infinity, which is looked for later."""
     with np.errstate(over="ignore"):
@@ -216,21 +251,24 @@ def as_tensor(values: NDArray) -> Tensor:
     return torch.from_numpy(array)
 
 
-def read_content(path: Path, kind: str) -> bytes:
-    """The bytes of a file.
+@contextlib.contextmanager
+def reading(path: Path, kind: str) -> Iterator[None]:
+    """Errors of the system in this block as errors of the file.
 
     Raises:
         FileFormatError: If it cannot be read.
     """
     try:
-        return path.read_bytes()
+        yield
     except OSError as error:
-        raise FileFormatError(
-            path,
-            expected=f"a readable {kind} file",
-            found=str(error.strerror),
-            remedy="check the path and its permissions",
-        ) from error
+        remedy = "check the path and its permissions"
+        raise damaged(path, f"a readable {kind} file", str(error.strerror), remedy) from error
+
+
+def read_content(path: Path, kind: str) -> bytes:
+    """The bytes of a file; raises as `reading`."""
+    with reading(path, kind):
+        return path.read_bytes()
 
 
 def rounded_centers(places: NDArray[np.float64], log_scales: Tensor, path: Path) -> Tensor:

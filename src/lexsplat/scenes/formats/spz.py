@@ -31,9 +31,11 @@ from lexsplat.scenes.formats.foreign import (
     as_tensor,
     check_count,
     logits_of_bytes,
+    parsing,
     read_content,
-    reason,
     warn,
+    with_the_largest,
+    without_the_largest,
 )
 from lexsplat.scenes.transforms import transformed
 
@@ -86,7 +88,7 @@ def read_spz(path: Path) -> Gaussians:
         FileFormatError: If the file is damaged or has another version.
     """
     content = read_content(path, ".spz")
-    try:
+    with parsing(path, "an SPZ file", zstandard.ZstdError):
         head = zlib.decompressobj(31).decompress(content, 16) if content[:2] == b"\x1f\x8b" else content[:32]
         if len(head) < _HEADER.size:
             raise Damage(f"a header of {len(head)} bytes")
@@ -100,8 +102,6 @@ def read_spz(path: Path) -> Gaussians:
             extensions = content[_HEADER_4.size : _HEADER_4.unpack_from(content)[-1]]
         else:
             streams, extensions = _inflated(content, sizes, bool(flags & _EXTENSIONS))
-    except (zlib.error, zstandard.ZstdError, struct.error, Damage) as error:
-        raise FileFormatError(path, expected="an SPZ file", found=reason(error), remedy=AGAIN) from error
     rotation = _rotation(extensions, path) if flags & _EXTENSIONS else HALF_TURN
     arrays = {
         name: np.frombuffer(data, np.uint8).reshape(count, layout[name]) for name, data in streams.items()
@@ -243,12 +243,7 @@ def _quats(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
     largest = words >> 30
     fields = np.stack([words >> 20, words >> 10, words], 1) & 1023
     small = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / 511 * math.sqrt(0.5)
-    quats = np.zeros((len(words), 4))
-    for index in range(4):
-        rows, others = largest == index, [i for i in range(4) if i != index]
-        quats[np.ix_(rows, others)] = small[rows]
-        quats[rows, index] = np.sqrt(np.maximum(0, 1 - (small[rows] ** 2).sum(1)))
-    return quats[:, [3, 0, 1, 2]]
+    return with_the_largest(small, largest)[:, [3, 0, 1, 2]]
 
 
 def write_spz(gaussians: Gaussians, path: Path, *, version: int = 4) -> None:
@@ -337,13 +332,7 @@ def _bytes(values: Tensor) -> NDArray[np.uint8]:
 
 def _packed_quats(quats: NDArray[np.float64]) -> NDArray[np.uint32]:
     """Quaternions wxyz of unit length in 32 bits each; see `_quats`."""
-    xyzw = quats[:, [1, 2, 3, 0]]
-    largest = np.abs(xyzw).argmax(1)
-    rows = np.arange(len(xyzw))
-    xyzw = xyzw * np.where(xyzw[rows, largest] < 0, -1, 1)[:, None]
-    kept = np.arange(4)[None].repeat(len(xyzw), 0)
-    kept = kept[kept != largest[:, None]].reshape(-1, 3)
-    small = np.take_along_axis(xyzw, kept, 1)
+    small, largest = without_the_largest(quats[:, [1, 2, 3, 0]])
     fields = np.round(np.abs(small) * math.sqrt(2) * 511).clip(0, 511).astype(np.uint32)
     fields |= np.where(small < 0, 512, 0).astype(np.uint32)
     words = largest.astype(np.uint32) << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]

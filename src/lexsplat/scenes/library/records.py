@@ -130,21 +130,17 @@ def read_record(path: Path) -> Record:
         FileFormatError: If it is damaged.
     """
     try:
-        return checked_record(read_json(path), path)
+        return _checked(read_json(path), path)
     except FileFormatError as error:
         raise damaged(path, error.expected, error.found) from error
 
 
-def checked_record(content: Any, path: Path) -> Record:
-    """A record from plain data.
-
-    Raises:
-        FileFormatError: If an entry is missing, of a wrong type or altered.
-    """
+def _checked(content: Any, path: Path) -> Record:
+    """A record from plain data, of which no entry is missing, of a wrong type or altered."""
     try:
         if not isinstance(content, dict):
             raise ValueError("other values")
-        if _HASH in content and content[_HASH] != _hash(content):
+        if _HASH in content and content[_HASH] != hash_of(content):
             raise ValueError("damaged content (the hash differs)")
         values: dict[str, Any] = {
             field.name: (int if field.type == "int" else str)(content[field.name])
@@ -166,7 +162,7 @@ def copy_of_record(path: Path) -> Record | None:
     """The copy of a record in the file of the codes; None if it is damaged."""
     try:
         _, metadata = read_tensors(path)
-        return checked_record(json.loads(metadata["record"]), path)
+        return _checked(json.loads(metadata["record"]), path)
     except (FileFormatError, KeyError, ValueError, RecursionError):
         return None
 
@@ -214,7 +210,8 @@ def _own_files(stage: Path) -> list[tuple[str, str]]:
     return [(file, found[1]) for file in listed if (found := OWN_FILE.fullmatch(file))]
 
 
-def _hash(content: Mapping[str, Any]) -> str:
+def hash_of(content: Mapping[str, Any]) -> str:
+    """The hash of all other values, which is written with them."""
     return fingerprint({name: value for name, value in content.items() if name != _HASH})
 
 
