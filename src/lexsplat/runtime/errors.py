@@ -6,6 +6,8 @@ arguments of Python functions raise ``ValueError``.
 
 from __future__ import annotations
 
+from functools import partial
+
 STOPPED = "stopped; run the same command again to go on"
 """Message after Ctrl-C."""
 
@@ -46,11 +48,7 @@ class LexsplatError(Exception):
 
     def __reduce__(self) -> tuple:
         fields = {"expected": self.expected, "found": self.found, "remedy": self.remedy}
-        return (_rebuild, (type(self), self.subject, fields))
-
-
-def _rebuild(kind: type[LexsplatError], subject: str, fields: dict[str, str]) -> LexsplatError:
-    return kind(subject, **fields)
+        return (partial(type(self), self.subject, **fields), ())
 
 
 class CaptureError(LexsplatError):
