@@ -43,7 +43,7 @@ from lexsplat.evaluation.report import (
     write_rows,
 )
 from lexsplat.evaluation.results import plain
-from lexsplat.features import FeatureMaps, TextCache, load_level_maps
+from lexsplat.features import TextCache, load_level_maps
 from lexsplat.language.code_maps import MaskedCodeMaps
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.methods import METHODS
@@ -151,22 +151,15 @@ class Bench:
         self._encoders = Encoders(
             config.clip, config.dino, self.config.encoder_device, config.features.segments
         )
-        self._maps: FeatureMaps | None = None
+        # Features of every view, the held-out ones too, outside every measured time.
+        self.maps = feature_maps(
+            self.capture, self.config, self._encoders, self.folder.features_path, listener
+        )
         self._texts = TextCache(self.folder.root / "checkpoints" / "texts")
         self._last: tuple[str, LanguageField | Method, dict[str, float], Peaks] | None = None
         self._codebook_peaks: Peaks = {}
-        _ = self.maps  # of the held-out views too, outside every measured time
 
     # -- shared stages
-
-    @property
-    def maps(self) -> FeatureMaps:
-        """Features of every view, read from the cache."""
-        if self._maps is None:
-            self._maps = feature_maps(
-                self.capture, self.config, self._encoders, self.folder.features_path, self.listener
-            )
-        return self._maps
 
     def level_maps(self, name: str) -> tuple[Tensor, list[float]]:
         """The CLIP map of each crop size of a view, and the sides of the crops (`features.load_level_maps`)."""
@@ -177,7 +170,6 @@ class Bench:
                 found="one feature a pixel",
                 remedy="leave --features-from out, or the method (lerf) with --methods",
             )
-        _ = self.maps  # stores the features of all views
         return load_level_maps(
             self.capture, self._encoders.clip, self.config.features, self.folder.features_path, name
         )
@@ -307,8 +299,7 @@ class Bench:
         """The language, its seconds and peaks; a language that is measured in two forms is made once."""
         if self._last is None or self._last[0] != key:
             self._last, self._codebook_peaks = None, {}  # frees the language made before
-            if self._maps is not None:
-                self._maps.forget()
+            self.maps.forget()
             forget_peak_memory()
             language, seconds = make()
             peaks = {
