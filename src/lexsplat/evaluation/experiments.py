@@ -10,7 +10,7 @@ import json
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -34,14 +34,7 @@ from lexsplat.evaluation import (
     peak_memory,
 )
 from lexsplat.evaluation.ground_truth import read_held_out
-from lexsplat.evaluation.report import (
-    Comparison,
-    Gallery,
-    MeasuredMethod,
-    table_rows,
-    write_comparison,
-    write_rows,
-)
+from lexsplat.evaluation.report import Gallery, MeasuredMethod, table_rows, write_comparison, write_rows
 from lexsplat.evaluation.results import plain
 from lexsplat.features import TextCache, load_level_maps
 from lexsplat.language.code_maps import MaskedCodeMaps
@@ -95,15 +88,13 @@ class MeasuredRun:
 
     Args:
         result: The content of its ``metrics.json``.
-        kept: Whether it was measured by an earlier command.
         detail: "curves" and "cases" as `report.MeasuredMethod` has them.
         images: File of its images; None if none were kept.
     """
 
     result: dict[str, Any]
-    kept: bool
-    detail: dict[str, Any] = field(default_factory=dict)
-    images: Path | None = None
+    detail: dict[str, Any]
+    images: Path | None
 
 
 class Bench:
@@ -265,7 +256,7 @@ class Bench:
                 stored = read_json(path)
                 if stored["fingerprint"] == inputs:
                     detail = stored.get("detail", {})
-                    return MeasuredRun(stored["metrics"], True, detail, images if images.is_file() else None)
+                    return MeasuredRun(stored["metrics"], detail, images if images.is_file() else None)
             except (FileFormatError, KeyError, TypeError) as error:
                 log.warning("%s is damaged and is measured again (%s)", path, error)
         language, seconds, peaks = self._made(
@@ -291,7 +282,7 @@ class Bench:
             write_tensors(images, gallery.tensors(), {"fingerprint": inputs})
         stored = {"fingerprint": inputs, "name": row.name, "seed": seed, "metrics": result, "detail": detail}
         write_json(path, stored)
-        return MeasuredRun(result, False, detail, images if keep_images else None)
+        return MeasuredRun(result, detail, images if keep_images else None)
 
     def _made(
         self, key: str, make: Callable[[], Made]
@@ -361,14 +352,14 @@ def write_results(
     }
     write_rows(folder, stem, rows, columns)
     write_json(folder / f"{stem}.json", content)
-    comparison = Comparison(
+    write_comparison(
+        folder / f"{stem}.html",
         [_with_images(name, done) for name, done in runs.items()],
-        title=f"lexsplat {'ablate' if stem == 'ablation' else 'compare'}: {bench.capture.root.name}",
-        columns=columns,
+        f"lexsplat {'ablate' if stem == 'ablation' else 'compare'}: {bench.capture.root.name}",
+        columns,
         config={**config, **facts},
         machine=machine,
     )
-    write_comparison(folder / f"{stem}.html", comparison)
     return rows
 
 

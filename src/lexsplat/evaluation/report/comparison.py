@@ -67,41 +67,38 @@ class MeasuredMethod:
         return {p: mean_and_std([row[p].get(key) for row in rows if p in row]) for p in prompts}
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Content of the page.
+def write_comparison(
+    path: Path,
+    methods: Sequence[MeasuredMethod],
+    title: str,
+    columns: Sequence[str] = (),
+    *,
+    config: Mapping[str, Any],
+    machine: Mapping[str, Any],
+) -> None:
+    """Write the page, whole or not at all.
 
     Args:
+        path: The file.
         methods: The measured methods, in the order of the table.
         title: Heading of the page.
         columns: Keys of the table; empty: the columns of the paper's Table 1 and ours.
         config: Settings, with "seeds".
         machine: What it ran on.
     """
-
-    methods: Sequence[MeasuredMethod]
-    title: str
-    columns: Sequence[str] = ()
-    config: Mapping[str, Any] = field(default_factory=dict)
-    machine: Mapping[str, Any] = field(default_factory=dict)
-
-
-def write_comparison(path: Path, comparison: Comparison) -> None:
-    """Write the page, whole or not at all."""
-    methods = comparison.methods
     rows = table_rows({method.name: method.results for method in methods})
     ranked = _worst_first(methods)
     shown = ranked[:MAX_CASES]
     stages, seconds = _seconds(methods)
     views = _shared_views(methods)
     content = {
-        "title": comparison.title,
+        "title": title,
         "subtitle": "The same Gaussians and the same features, measured on held-out views",
         "cards": _cards(methods, rows),
         "methods": methods,
         "method_names": [method.name for method in methods],
         "colors": {method.name: index % COLORS for index, method in enumerate(methods)},
-        "table": _table(rows, comparison.columns),
+        "table": _table(rows, columns),
         "other_protocols": _table(rows, OTHER_PROTOCOLS),
         "reference_rows": [str(row["name"]) for row in rows if row["name"] in REFERENCE_ROWS],
         "seeds": max((int(row["runs"]) for row in rows), default=1),
@@ -115,8 +112,8 @@ def write_comparison(path: Path, comparison: Comparison) -> None:
         "details": [(method.name, prompts) for method in methods if (prompts := _details(method))],
         "stages": stages,
         "stage_seconds": seconds,
-        "config": comparison.config,
-        "machine": comparison.machine,
+        "config": config,
+        "machine": machine,
         "shown_views": [view for view in views if view in {view for view, _ in shown}],
     }
     write_page(path, "comparison.html", content, views)
