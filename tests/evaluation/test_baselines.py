@@ -83,8 +83,15 @@ def pixel_accuracy(method, balls, maps_shape=(24, 32)):
 # Full-dimensional features
 
 
+def training_data(balls):
+    """Views with maps of 16x12 cells."""
+    return TrainingData(
+        balls.gaussians, balls.cameras, {name: FeatureMap(torch.zeros(12, 16, 1)) for name in balls.cameras}
+    )
+
+
 def test_back_projection_is_the_transpose_of_rendering(balls):
-    views = TrainingViews(balls.gaussians, balls.cameras, lambda name: (16, 12))
+    views = TrainingViews(training_data(balls))
     camera, prepared = views.prepared("view0")
     weights = render(balls.gaussians, camera, features=torch.eye(len(balls.gaussians)), color=False).features
     values = torch.randn(camera.height, camera.width, 70, generator=torch.Generator().manual_seed(0))
@@ -94,11 +101,11 @@ def test_back_projection_is_the_transpose_of_rendering(balls):
 
 
 def test_the_mean_of_a_constant_is_that_constant_where_a_gaussian_was_seen(balls):
-    views = TrainingViews(balls.gaussians, balls.cameras, lambda name: (16, 12), scale=2)
+    views = TrainingViews(training_data(balls), scale=2)
     events = []
     constant = torch.tensor([0.25, -1.0])
     features, weights = back_projected_mean(
-        views, lambda name, camera: constant.expand(camera.height, camera.width, 2), listener=events.append
+        views, lambda name: constant.expand(24, 32, 2), listener=events.append
     )
     assert events == [1, 2, 3, 4, 5, 6]
     seen = weights >= 0.01

@@ -206,11 +206,11 @@ class Ovs3d:
             raise ValueError(f"3dovs needs the prompts of the evaluation, at least two classes, got {found}")
         config = self.settings
         (classes,) = unit_texts(run.classes)
-        views = data.views(run.memory)
+        views = TrainingViews(data, memory=run.memory)
         total = len(views.names) + config.steps
         start, weights = back_projected_mean(
             views,
-            lambda name, camera: resized_map(data.maps[name].clip, camera),
+            lambda name: data.maps[name].clip,
             listener=lambda done: run.listener(Event("3dovs", done, total)),
         )
         fit = _Fit(data, views, start, classes.to(start.device), config)
