@@ -83,11 +83,10 @@ def pixel_accuracy(method, balls, maps_shape=(24, 32)):
 # Full-dimensional features
 
 
-def training_data(balls):
-    """Views with maps of 16x12 cells."""
-    return TrainingData(
-        balls.gaussians, balls.cameras, {name: FeatureMap(torch.zeros(12, 16, 1)) for name in balls.cameras}
-    )
+def training_data(balls, maps=None):
+    """Data for methods that need no crop sizes; without maps, views have some of 16x12 cells."""
+    maps = maps or {name: FeatureMap(torch.zeros(12, 16, 1)) for name in balls.cameras}
+    return TrainingData(balls.gaussians, balls.cameras, maps, level_maps=None)
 
 
 def test_back_projection_is_the_transpose_of_rendering(balls):
@@ -130,7 +129,7 @@ def test_cosines_in_chunks_are_those_of_the_whole_feature(balls):
 
 
 def test_distilled_features_find_the_balls(balls, maps):
-    data = TrainingData(balls.gaussians, balls.cameras, maps)
+    data = training_data(balls, maps)
     found = Dff(DffConfig(steps=20)).fit(data, BaselineRun({}))
     assert isinstance(found, Method)
     assert ball_scores(found, balls) > 0.85
@@ -152,7 +151,7 @@ def test_distilling_moves_from_the_mean_towards_the_least_squares_solution_and_i
     def error(features):
         return float((system @ features.double() - target).square().mean())
 
-    data = TrainingData(balls.gaussians, balls.cameras, noisy)
+    data = training_data(balls, noisy)
     average = Dff(DffConfig(steps=0)).fit(data, BaselineRun({}))
     fitted = Dff(DffConfig(steps=40, learning_rate=0.05)).fit(data, BaselineRun({}))
     left = (error(fitted.features[0]) - error(best)) / (error(average.features[0]) - error(best))

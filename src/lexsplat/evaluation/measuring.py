@@ -12,7 +12,7 @@ size and resizes the ground truth, as the authors do.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from lexsplat.captures.ground_truth.layouts import load_ground_truth
+from lexsplat.captures.ground_truth.layouts import load_annotations, load_ground_truth
 from lexsplat.evaluation.ground_truth import GroundTruth
 from lexsplat.evaluation.memory import peak_gpu_memory, peak_memory
 from lexsplat.evaluation.methods import MethodScene
@@ -102,8 +101,6 @@ def evaluate(
     """
     config = config or EvaluationConfig()
     if ground_truth is None:
-        from lexsplat.captures import load_annotations
-
         found = load_annotations(capture)
         ground_truth = GroundTruth(found.masks, found.boxes)
     listener(Event("evaluate", 0, len(capture.test_names)))
@@ -119,8 +116,8 @@ def evaluate(
         speed={**run.speed(), "stage_seconds": {}},
         size={
             "gaussians": len(scene.gaussians),
-            "language_bytes": _bytes(scene.field.tensors()),
-            "gaussian_bytes": _bytes(scene.gaussians.tensors()),
+            "language_bytes": sum(tensor.nbytes for tensor in scene.field.tensors().values()),
+            "gaussian_bytes": sum(tensor.nbytes for tensor in scene.gaussians.tensors().values()),
             "peak_rss_bytes": peak_memory(),
             "peak_gpu_bytes": peak_gpu_memory(scene.gaussians.device),
         },
@@ -291,7 +288,3 @@ class _Evaluation:
         for camera in cameras:
             work(camera)
         return max(time.perf_counter() - start, 1e-9) / len(cameras)
-
-
-def _bytes(tensors: Mapping[str, Tensor]) -> int:
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())

@@ -56,7 +56,7 @@ class FeatureMap:
     @property
     def nbytes(self) -> int:
         """Bytes held in memory."""
-        own = sum(part.numel() * part.element_size() for part in (self.clip, self.dino) if part is not None)
+        own = sum(part.nbytes for part in (self.clip, self.dino) if part is not None)
         return own + sum(level.nbytes for level in self.levels)
 
 

@@ -48,17 +48,7 @@ class TrainingData:
     gaussians: Gaussians
     cameras: Mapping[str, Camera]
     maps: Mapping[str, FeatureMap]
-    level_maps: LevelMaps | None = None
-
-    def levels(self) -> LevelMaps:
-        """Features of each crop size.
-
-        Raises:
-            ValueError: If there are none.
-        """
-        if self.level_maps is None:
-            raise ValueError("this method needs the features of each crop size (level_maps)")
-        return self.level_maps
+    level_maps: LevelMaps
 
 
 class TrainingViews:

@@ -147,7 +147,7 @@ class Lerf:
         The DINO part of the features regularizes. The seed has no effect. Events are of stage "lerf".
         """
         config = self.settings
-        maps, level_maps, views = data.maps, data.levels(), TrainingViews(data, memory=run.memory)
+        maps, level_maps, views = data.maps, data.level_maps, TrainingViews(data, memory=run.memory)
         scales = physical_scales(views, level_maps, config.scales)
         total = (config.scales + 1) * len(views.names)
         found = []

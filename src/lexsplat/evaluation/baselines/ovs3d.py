@@ -147,7 +147,7 @@ class _Fit:
     def __init__(
         self, data: TrainingData, views: TrainingViews, start: Tensor, classes: Tensor, config: Ovs3dConfig
     ) -> None:
-        self.views, self.maps, self.level_maps = views, data.maps, data.levels()
+        self.views, self.maps, self.level_maps = views, data.maps, data.level_maps
         self.classes, self.config = classes, config
         self.features = start.clone().requires_grad_()
         levels = len(self.level_maps(views.names[0])[1])
