@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from lexsplat.features.checks import bundled_images
 from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
-from lexsplat.features.extraction import cpu_batch, encoded_size, parallel_views
+from lexsplat.features.extraction import cpu_batch, crop_levels, encoded_size, parallel_views
 from lexsplat.features.pretrained import resize_images
-from lexsplat.features.pyramid import cut_crops, encode_stream, grid_levels, random_levels, unique_boxes
+from lexsplat.features.pyramid import cut_crops, encode_stream, unique_boxes
 from lexsplat.features.settings import FeatureConfig
 from lexsplat.runtime.progress import duration
 
@@ -87,11 +87,7 @@ def _crop_seconds(clip: ImageTextEncoder, config: FeatureConfig, capture_size: t
 
 def _boxes(config: FeatureConfig, capture_size: tuple[int, int]) -> NDArray[np.int32]:
     """The crops of a photo of this width and height ``[n, 3]``."""
-    size = encoded_size(capture_size, config)
-    if config.mode == "grid":
-        return unique_boxes(grid_levels(*size, config.crop_sizes, config.crop_strides))[0]
-    sides = np.linspace(*config.random_sizes, config.random_levels).tolist()
-    return unique_boxes(random_levels(*size, sides, config.random_crops, np.random.default_rng(0)))[0]
+    return unique_boxes(crop_levels(encoded_size(capture_size, config), config, seed=0))[0]
 
 
 def count_crops(config: FeatureConfig, capture_size: tuple[int, int]) -> int:

@@ -90,16 +90,13 @@ def extract_features(
     config = config or FeatureConfig()
     cache_dir = Path(cache_dir)
     entries = {name: _Entry.of(view, clip, dino, config, cache_dir) for name, view in capture.views.items()}
-    missing = [name for name, entry in entries.items() if not entry.is_complete()]
-    done, total = len(entries) - len(missing), len(entries)
+    twins = _missing(entries)
+    missing, total = sum(map(len, twins.values())), len(entries)
+    done = total - missing
     listener(Event("features", done, total))
     largest = max([1, *(_view_bytes(capture.views[n], entries[n], clip, config, memory) for n in entries)])
-    workers = min(parallel_views(clip.device), max(1, len(missing)))
+    workers = min(parallel_views(clip.device), max(1, missing))
     workers = max(1, min(workers, memory // 2 // largest))
-    same_files: dict[tuple[Path, Path | None], list[str]] = {}  # views of identical photos share their files
-    for name in missing:
-        same_files.setdefault((entries[name].clip, entries[name].dino), []).append(name)
-    twins = {names[0]: names for names in same_files.values()}
     batch_size = batch_size_for(memory // workers, clip.image_size)
     extraction = _Extraction(capture.views, entries, clip, dino, config, batch_size)
     for name in extraction.run(list(twins), workers):
@@ -123,9 +120,14 @@ def missing_views(
     cache_dir: Path,
 ) -> dict[str, tuple[str, ...]]:
     """Views whose features are not cached, by the name of the first view of the same photo."""
+    views = capture.views.items()
+    return _missing({name: _Entry.of(view, clip, dino, config, Path(cache_dir)) for name, view in views})
+
+
+def _missing(entries: Mapping[str, _Entry]) -> dict[str, tuple[str, ...]]:
+    """See `missing_views`; views of identical photos share their files."""
     same_files: dict[tuple[Path, Path | None], tuple[str, ...]] = {}
-    for name, view in capture.views.items():
-        entry = _Entry.of(view, clip, dino, config, Path(cache_dir))
+    for name, entry in entries.items():
         if not entry.is_complete():
             same_files[entry.clip, entry.dino] = (*same_files.get((entry.clip, entry.dino), ()), name)
     return {names[0]: names for names in same_files.values()}
@@ -142,7 +144,7 @@ def _view_bytes(view: View, entry: _Entry, clip: ImageTextEncoder, config: Featu
     need = budget.photo_bytes(photo, entry.image_size)
     if config.tokens == "class":
         return need
-    crops = sum(map(len, grid_levels(*entry.image_size, config.crop_sizes, config.crop_strides)))
+    crops = sum(map(len, crop_levels(entry.image_size, config, entry.seed)))
     patches = 2 * 4 * crops * (1 + clip.patches**2) * clip.dim
     what, remedy = f"the patches of {crops:,} crops", "features.crop-tokens class"
     budget.require("features", 2 * patches, memory, what, remedy)
@@ -178,6 +180,14 @@ def encoded_size(capture_size: tuple[int, int], config: FeatureConfig) -> tuple[
     """Width and height at which a photo is cut into crops."""
     factor = min(1.0, config.max_short_side / min(capture_size))
     return max(1, round(capture_size[0] * factor)), max(1, round(capture_size[1] * factor))
+
+
+def crop_levels(size: tuple[int, int], config: FeatureConfig, seed: int) -> tuple[CropLevel, ...]:
+    """The crops of a photo of this width and height; the seed is that of random ones."""
+    if config.mode == "grid":
+        return grid_levels(*size, config.crop_sizes, config.crop_strides)
+    fractions = np.linspace(*config.random_sizes, config.random_levels).tolist()
+    return random_levels(*size, fractions, config.random_crops, np.random.default_rng(seed))
 
 
 def size_of_map(capture_size: tuple[int, int], config: FeatureConfig) -> tuple[int, int]:
@@ -328,7 +338,7 @@ class _Extraction:
             if is_stored(entry.clip):
                 self._finished.put(name)
                 continue
-            levels = self._levels(entry)
+            levels = crop_levels(entry.image_size, self.config, entry.seed)
             boxes, places = unique_boxes(levels)
             crops = cut_crops(image.to(self.clip.device), boxes, self.clip.image_size, self.batch_size)
             yield (name, levels, torch.from_numpy(places)), crops
@@ -343,12 +353,3 @@ class _Extraction:
             layer=config.dino_layer,
             max_tokens=config.dino_max_tokens,
         )
-
-    def _levels(self, entry: _Entry) -> tuple[CropLevel, ...]:
-        config, (width, height) = self.config, entry.image_size
-        if config.mode == "grid":
-            return grid_levels(width, height, config.crop_sizes, config.crop_strides)
-        smallest, largest = config.random_sizes
-        fractions = np.linspace(smallest, largest, config.random_levels).tolist()
-        rng = np.random.default_rng(entry.seed)
-        return random_levels(width, height, fractions, config.random_crops, rng)
