@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.features.cache import FeatureMap, FeatureMaps, hash_of, is_stored, read_labels, write_labels
-from lexsplat.features.external import open_npy, segment_numbers
+from lexsplat.features.external import open_npy, segment_numbers, wrong
 from lexsplat.features.extraction import pixels_hash, size_of_map
 from lexsplat.features.settings import FeatureConfig
 from lexsplat.runtime.errors import FileFormatError, ModelError
@@ -38,7 +38,6 @@ SUPERPIXELS = (3000, 1000)
 
 _COMPACTNESS = 10.0  # of superpixels: weight of distance beside that of color
 _SHORT_SIDE = 480  # pixels of the photo in which superpixels are searched: about four a cell
-_ENDINGS = (".png", ".npy", "_s.npy")
 
 
 class Segmenter(Protocol):
@@ -158,16 +157,12 @@ class SegmentFolder:
         Raises:
             FileFormatError: If there is none.
         """
-        paths = [self.folder / f"{view.stem}{ending}" for ending in _ENDINGS]
+        paths = [self.folder / f"{view.stem}{ending}" for ending in (".png", ".npy", "_s.npy")]
         found = next((path for path in paths if path.is_file()), None)
         if found is None:
-            raise FileFormatError(
-                self.folder,
-                expected=", ".join(f"{view.stem}{ending}" for ending in _ENDINGS[:-1])
-                + f" or {view.stem}{_ENDINGS[-1]}",
-                found="none of them",
-                remedy="give one map of segments a photo, named after it without its suffix",
-            )
+            expected = f"{view.stem}.png, {view.stem}.npy or {view.stem}_s.npy"
+            remedy = "give one map of segments a photo, named after it without its suffix"
+            raise wrong(self.folder, expected, "none of them", remedy)
         return found
 
     def labels(self, view: View, size: tuple[int, int]) -> NDArray[np.int32]:
@@ -183,12 +178,7 @@ class SegmentFolder:
         else:
             levels = open_npy(path)
             if levels.ndim not in (2, 3) or 0 in levels.shape:
-                raise FileFormatError(
-                    path,
-                    expected="segments [h, w] or [levels, h, w]",
-                    found=str(list(levels.shape)),
-                    remedy="write it again (docs/captures.md has the layout)",
-                )
+                raise wrong(path, "segments [h, w] or [levels, h, w]", list(levels.shape))
             levels = levels.reshape(-1, *levels.shape[-2:])
         sampled = np.stack([view.undistort_mask(level, path, size) for level in levels])
         return segment_numbers(sampled, path).astype(np.int32)
@@ -200,12 +190,8 @@ def _png_numbers(path: Path) -> NDArray[np.int32]:
 
     with open_image(path) as image:
         if image.mode not in ("1", "L", "P", "I") and not image.mode.startswith("I;"):
-            raise FileFormatError(
-                path,
-                expected="one number a pixel, 8 or 16 bits",
-                found=f"an image of mode {image.mode}",
-                remedy="write the numbers of segments, not colors",
-            )
+            remedy = "write the numbers of segments, not colors"
+            raise wrong(path, "one number a pixel, 8 or 16 bits", f"an image of mode {image.mode}", remedy)
         return np.asarray(image).astype(np.int32) - 1
 
 
