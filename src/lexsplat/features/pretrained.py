@@ -26,6 +26,9 @@ from lexsplat.runtime.errors import ModelError
 
 log = logging.getLogger("lexsplat")
 
+IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Mean and standard deviation of the colors of ImageNet."""
+
 _CLEARLY = 0.8
 """Share of the time in float32 below which bfloat16 is chosen, so that noise does not decide."""
 
