@@ -206,11 +206,7 @@ class ClipEncoder(PretrainedModel):
 
 
 def _load_tokenizer(folder: Path, name: str, config: Any) -> Any:
-    """The tokenizer of a model.
-
-    Raises:
-        ModelError: If it cannot be loaded, or its vocabulary is not the model's.
-    """
+    """The tokenizer of a model."""
     from transformers import AutoTokenizer
 
     refusal = functools.partial(ModelError, f"model {name}")

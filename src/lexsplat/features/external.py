@@ -200,11 +200,7 @@ class _Reading:
         return FeatureMap(_unit(total, path))
 
     def open_segments(self, path: Path) -> tuple[NDArray, NDArray]:
-        """Features of segments ``[n, D]``, and the segments of the pixels ``[h, w]`` or ``[L, h, w]``, mapped.
-
-        Raises:
-            FileFormatError: If one has another shape, or the pixels not the photo's aspect.
-        """
+        """Features of segments ``[n, D]``, and the segments of the pixels ``[h, w]`` or ``[L, h, w]``, mapped."""
         features, pixels = open_npy(path), _segments_of(path)
         if features.ndim != 2 or 0 in features.shape:
             raise wrong(path, "features of segments [n, D]", list(features.shape))
@@ -215,11 +211,7 @@ class _Reading:
         return features, numbers
 
     def check_aspect(self, shape: tuple[int, ...], path: Path) -> None:
-        """Refuse an array ``[h, w, D]`` of another shape, or without the photo's aspect.
-
-        Raises:
-            FileFormatError: If it is one.
-        """
+        """Refuse an array ``[h, w, D]`` of another shape, or without the photo's aspect."""
         if len(shape) != 3 or 0 in shape:
             raise wrong(path, "features [h, w, D]", list(shape))
         height, width, _ = shape
@@ -236,12 +228,7 @@ class _Reading:
     def _cells(
         self, shape: tuple[int, ...], itemsize: int, path: Path
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows and columns to read of an array ``[h, w, D]``.
-
-        Raises:
-            FileFormatError: As `check_aspect`.
-            MemoryBudgetError: If the map does not fit.
-        """
+        """Rows and columns to read of an array ``[h, w, D]``."""
         self.check_aspect(shape, path)
         height, width, depth = shape
         rows, columns = min(height, self.view.camera.height), min(width, self.view.camera.width)

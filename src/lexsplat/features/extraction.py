@@ -134,11 +134,7 @@ def _missing(entries: Mapping[str, _Entry]) -> dict[str, tuple[str, ...]]:
 
 
 def _view_bytes(view: View, entry: _Entry, clip: ImageTextEncoder, config: FeatureConfig, memory: int) -> int:
-    """Bytes that one view takes while it is processed: its photo, and the embeddings of its patches with a copy.
-
-    Raises:
-        MemoryBudgetError: If the photo does not fit, or the patches take more than half of ``memory``.
-    """
+    """Bytes that one view takes while it is processed: its photo, and the embeddings of its patches with a copy."""
     photo = view.lens.width, view.lens.height
     budget.check_photo(photo, memory, entry.image_size)
     need = budget.photo_bytes(photo, entry.image_size)

@@ -263,16 +263,7 @@ def _cached_folder(name: str, tower: str) -> tuple[Path | None, str]:
 
 
 def _download(name: str, tower: str, lacking: str) -> Path:
-    """Download a model from the hub; logs its license and size first.
-
-    Args:
-        name: The name.
-        tower: See `model_folder`.
-        lacking: What a copy in the cache lacks, in words; "" without a copy.
-
-    Raises:
-        ModelError: For each cause with a remedy of its own.
-    """
+    """Download a model from the hub; logs its license and size first. ``lacking``: what a copy in the cache lacks."""
     from huggingface_hub import HfApi, constants, snapshot_download
 
     cache = Path(constants.HF_HUB_CACHE)

@@ -64,11 +64,7 @@ class PretrainedModel:
         return ModelError(f"model {self.name}", expected=expected, found=found, remedy=remedy)
 
     def _finite(self, compute: Callable[[], Tensor], *, crops: bool = False) -> Tensor:
-        """Features in half precision where that is faster, or in full precision from the first overflow on.
-
-        Raises:
-            ModelError: If they are not finite in full precision either.
-        """
+        """Features in half precision where that is faster, or in full precision from the first overflow on."""
         if not self._full_precision:
             with precision(self.device, crops=crops):
                 features = compute()

@@ -172,12 +172,7 @@ class _Store:
 
 
 def _read(path: Path) -> dict[str, Tensor]:
-    """The texts of a file and their embeddings.
-
-    Raises:
-        FileFormatError: If it is missing or damaged.
-        KeyError, ValueError, RecursionError: If it has other contents.
-    """
+    """The texts of a file and their embeddings."""
     tensors, facts = read_tensors(path)
     vectors, texts = tensors["embeddings"], json.loads(facts["texts"])
     if vectors.ndim != 2 or vectors.dtype != torch.float32 or not bool(vectors.isfinite().all()):

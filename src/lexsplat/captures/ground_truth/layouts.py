@@ -227,12 +227,7 @@ def _read_masks(capture: Capture, folder: Path, layout: str) -> Annotations:
 
 
 def _read_classes(path: Path) -> tuple[str, ...]:
-    """The names in ``classes.txt``, each the name of a file in a view's folder.
-
-    Raises:
-        CaptureError: If a name points outside the folder.
-        FileFormatError: If it is not UTF-8 text.
-    """
+    """The names in ``classes.txt``, each the name of a file in a view's folder."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

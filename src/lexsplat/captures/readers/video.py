@@ -190,12 +190,7 @@ def _fill_widest_gap(chosen: list[int], place: NDArray, score: NDArray) -> int:
 
 @contextlib.contextmanager
 def _open(video: Path, memory: int) -> Iterator[tuple[Any, Iterator[Any]]]:
-    """The video stream and its decoded frames, in order.
-
-    Raises:
-        BackendError: If PyAV is not installed.
-        CaptureError: If it cannot be opened or decoded, also during iteration.
-    """
+    """The video stream and its decoded frames, in order."""
     try:
         import av
     except ImportError as error:
@@ -223,11 +218,7 @@ def _open(video: Path, memory: int) -> Iterator[tuple[Any, Iterator[Any]]]:
 
 
 def _threads(video: Path, frame: tuple[int, int], memory: int) -> int:
-    """Number of decoding threads whose frames fit into the memory budget.
-
-    Raises:
-        MemoryBudgetError: If not even one thread fits.
-    """
+    """Number of decoding threads whose frames fit into the memory budget."""
     need = {
         threads: budget.video_bytes(frame, threads) for threads in range(1, min(16, os.cpu_count() or 1) + 1)
     }

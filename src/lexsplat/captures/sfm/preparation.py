@@ -208,11 +208,7 @@ def upright_size(path: Path) -> tuple[int, int]:
 
 
 def _look_at(folder: Path, name: str) -> _Photo:
-    """The header of a photo.
-
-    Raises:
-        CaptureError: If it is not an image, or is truncated.
-    """
+    """The header of a photo."""
     path = folder / name
     width, height = image_size(path)
     with open_image(path) as image:
