@@ -191,7 +191,6 @@ class Capture:
         points: Points of structure from motion ``[P, 3]``, world; P may be 0.
         point_colors: Their colors ``[P, 3]``, RGB in 0..1.
         warnings: What was skipped and why, one line each.
-        source: Format of the camera files: ``"colmap"`` or ``"transforms"``.
         background: Color behind transparent pixels, RGB in 0..1.
     """
 
@@ -202,7 +201,6 @@ class Capture:
     points: NDArray[np.float32] = field(default_factory=_no_points)
     point_colors: NDArray[np.float32] = field(default_factory=_no_points)
     warnings: tuple[str, ...] = ()
-    source: str = "colmap"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property

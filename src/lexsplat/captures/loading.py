@@ -82,7 +82,6 @@ def load_capture(
         points=files.points,
         point_colors=files.point_colors,
         warnings=tuple(warnings),
-        source=files.source,
         background=files.background,
     )
 

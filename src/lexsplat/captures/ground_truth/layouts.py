@@ -47,14 +47,12 @@ class Annotations:
             undistorted image.
         boxes: ``{view: {prompt: boxes}}``, ``[B, 4]`` as x0, y0, x1, y1 in pixels of the mask, if the data set has
             boxes.
-        classes: Names of all classes, if the data set lists them.
     """
 
     layout: str
     origin: Path
     masks: Mapping[str, Mapping[str, Path | NDArray[np.bool_]]]
     boxes: Mapping[str, Mapping[str, NDArray[np.float64]]] = field(default_factory=dict)
-    classes: tuple[str, ...] = ()
 
     def prompts(self) -> tuple[str, ...]:
         """All prompts with ground truth in any view, sorted."""
@@ -74,8 +72,7 @@ class Annotations:
             }
             return {view: prompts for view, prompts in kept.items() if prompts}
 
-        classes = tuple(names[name] for name in self.classes if name in names)
-        return Annotations(self.layout, self.origin, change(self.masks), change(self.boxes), classes)
+        return Annotations(self.layout, self.origin, change(self.masks), change(self.boxes))
 
 
 def find_annotations(root: Path) -> tuple[str, Path] | None:
@@ -223,7 +220,7 @@ def _read_masks(capture: Capture, folder: Path, layout: str) -> Annotations:
             view.check_mask(path)
         masks.setdefault(view.name, {}).update(files)
     ordered = {name: dict(sorted(masks[name].items())) for name in sorted(masks)}
-    return Annotations(layout, folder, ordered, classes=tuple(sorted(classes)))
+    return Annotations(layout, folder, ordered)
 
 
 def _read_classes(path: Path) -> tuple[str, ...]:

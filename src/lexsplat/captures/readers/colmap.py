@@ -15,7 +15,7 @@ import re
 import struct
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +38,6 @@ MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "dist
 
 IMAGE_FOLDERS = ("images", "input", "image", "rgb", "images_2", "images_4", "images_8", ".")
 """Folders of a capture that are searched for photos, in this order."""
-
-_COPY_AGAIN = "copy the file again, or run COLMAP again"
 
 
 def find_model(root: Path) -> Path | None:
@@ -67,43 +65,27 @@ def read_colmap(root: Path, model: Path, images: Path | None = None) -> CameraFi
     lenses = _lenses_by_id(model / f"cameras{suffix}")
     images_file = model / f"images{suffix}"
     if not images_file.is_file():
-        raise FileFormatError(
-            images_file, expected="the model's images", found="no such file", remedy=_COPY_AGAIN
-        )
+        raise _damaged(images_file, "the model's images", "no such file")
     entries = list(_read_images(images_file))
     names = [checked_name(entry.name, images_file) for entry in entries]
     folder = _image_folder(root, names) if images is None else images
     photos, missing = [], []
     for name, entry in zip(names, entries):
         if entry.camera_id not in lenses:
-            raise FileFormatError(
-                images_file,
-                expected=f"camera {entry.camera_id} of image {name} in cameras{suffix}",
-                found=f"cameras {sorted(lenses)[:8]}",
-                remedy=_COPY_AGAIN,
-            )
+            expected = f"camera {entry.camera_id} of image {name} in cameras{suffix}"
+            raise _damaged(images_file, expected, f"cameras {sorted(lenses)[:8]}")
         viewmat = _viewmat(entry.quaternion, entry.translation, name, images_file)
         if (folder / name).is_file():
             photos.append(Photo(name, folder / name, lenses[entry.camera_id], viewmat))
         else:
             missing.append(name)
+    found = CameraFiles(root=root, origin=model, photos=photos, missing=missing)
     points_file = model / f"points3D{suffix}"
-    points, colors, dropped = (
-        _read_points(points_file) if points_file.is_file() else (np.zeros((0, 3)), np.zeros((0, 3)), 0)
-    )
-    warnings = (
-        [f"{points_file}: {dropped} points with NaN, infinity or huge coordinates dropped"] if dropped else []
-    )
-    return CameraFiles(
-        root=root,
-        origin=model,
-        photos=photos,
-        source="colmap",
-        points=points.astype(np.float32),
-        point_colors=colors.astype(np.float32),
-        missing=missing,
-        warnings=warnings,
-    )
+    if not points_file.is_file():
+        return found
+    points, colors, dropped = _read_points(points_file)
+    warning = f"{points_file}: {dropped} points with NaN, infinity or huge coordinates dropped"
+    return replace(found, points=points, point_colors=colors, warnings=[warning] if dropped else [])
 
 
 def _lenses_by_id(file: Path) -> dict[int, Lens]:
@@ -133,7 +115,8 @@ def _viewmat(
 
 
 def _damaged(file: Path, expected: str, found: str) -> FileFormatError:
-    return FileFormatError(file, expected=expected, found=found, remedy=_COPY_AGAIN)
+    remedy = "copy the file again, or run COLMAP again"
+    return FileFormatError(file, expected=expected, found=found, remedy=remedy)
 
 
 class _Bytes:
@@ -279,15 +262,15 @@ def _are_observations(line: str) -> bool:
     return len(words) % 3 == 0
 
 
-def _read_points(file: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+def _read_points(file: Path) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
     """Points, colors in 0..1, and the number of points dropped for numbers that are not finite."""
     numbers = array("d")  # 8 bytes per number; a list of tuples takes 50
     for row in _point_rows_text(file) if file.suffix == ".txt" else _point_rows_binary(file):
         numbers.extend(row)
     table = np.array(numbers, dtype=np.float64).reshape(-1, 6)
     keep = np.isfinite(table).all(1) & (np.abs(table[:, :3]) < MAX_COORDINATE).all(1)
-    kept = table[keep]
-    return kept[:, :3], np.clip(kept[:, 3:] / 255.0, 0.0, 1.0), int((~keep).sum())
+    points, colors = table[keep, :3], np.clip(table[keep, 3:] / 255.0, 0.0, 1.0)
+    return points.astype(np.float32), colors.astype(np.float32), int((~keep).sum())
 
 
 def _point_rows_binary(file: Path) -> Iterator[tuple[float, ...]]:
