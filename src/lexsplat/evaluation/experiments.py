@@ -216,7 +216,7 @@ class Bench:
     def measure(
         self, stem: str, rows: Sequence[Row], seeds: Sequence[int], columns: Sequence[str] = ()
     ) -> list[dict[str, Any]]:
-        """Measure every row with every seed, and write the files of `write_results` after each run.
+        """Measure every row with every seed; writes ``STEM.json``, ``.csv``, ``.tex`` and ``.html`` after each run.
 
         Seed by seed, so that an interrupted command leaves complete tables of fewer seeds.
 
@@ -235,8 +235,43 @@ class Bench:
             for row in rows:
                 run = self.run(row, seed, keep_images=seed == seeds[0])
                 runs.setdefault(row.name, []).append(run)
-                table = write_results(self, stem, runs, columns)
+                table = self._write(stem, runs, columns)
         return table
+
+    def _write(
+        self, stem: str, runs: Mapping[str, Sequence[MeasuredRun]], columns: Sequence[str]
+    ) -> list[dict[str, Any]]:
+        """Write the files of the runs so far; returns the rows of the table."""
+        rows = table_rows({name: [run.result for run in done] for name, done in runs.items()})
+        languages = {name: [run.result["language"] for run in done] for name, done in runs.items()}
+        config, machine = to_json(self.config), machine_facts()
+        facts = {
+            "seeds": sorted({run.result["config"]["seed"] for done in runs.values() for run in done}),
+            "evaluation": to_json(self.evaluation),
+            "ground_truth": self.ground_truth.origin_facts(self.origin.prompt_list),
+        }
+        content = {
+            "rows": rows,
+            "config": config,
+            **facts,
+            "machine": machine,
+            "forms": {name: done[0]["form"] for name, done in languages.items()},
+            "runs": {name: [language["strict"] for language in done] for name, done in languages.items()},
+            "per_prompt": {
+                name: [language["per_prompt"] for language in done] for name, done in languages.items()
+            },
+        }
+        write_rows(self.output, stem, rows, columns)
+        write_json(self.output / f"{stem}.json", content)
+        write_comparison(
+            self.output / f"{stem}.html",
+            [_with_images(name, done) for name, done in runs.items()],
+            f"lexsplat {'ablate' if stem == 'ablation' else 'compare'}: {self.capture.root.name}",
+            columns,
+            config={**config, **facts},
+            machine=machine,
+        )
+        return rows
 
     def run(self, row: Row, seed: int, *, keep_images: bool = False) -> MeasuredRun:
         """Make and measure a language, unless the same settings, code and ground truth were measured before.
@@ -317,50 +352,6 @@ class Bench:
             for view, prompts in self.ground_truth.masks.items()
         }
         return [masks, self.ground_truth.boxes]
-
-
-def write_results(
-    bench: Bench, stem: str, runs: Mapping[str, Sequence[MeasuredRun]], columns: Sequence[str] = ()
-) -> list[dict[str, Any]]:
-    """Write ``STEM.json``, ``.csv``, ``.tex`` and ``.html`` of the runs so far; returns the rows of the table.
-
-    Args:
-        bench: The bench on which they were measured.
-        stem: "comparison" or "ablation".
-        runs: The runs of each row, in the order of the table.
-        columns: See `Bench.measure`.
-    """
-    folder = bench.output
-    rows = table_rows({name: [run.result for run in done] for name, done in runs.items()})
-    languages = {name: [run.result["language"] for run in done] for name, done in runs.items()}
-    config, machine = to_json(bench.config), machine_facts()
-    facts = {
-        "seeds": sorted({run.result["config"]["seed"] for done in runs.values() for run in done}),
-        "evaluation": to_json(bench.evaluation),
-        "ground_truth": bench.ground_truth.origin_facts(bench.origin.prompt_list),
-    }
-    content = {
-        "rows": rows,
-        "config": config,
-        **facts,
-        "machine": machine,
-        "forms": {name: done[0]["form"] for name, done in languages.items()},
-        "runs": {name: [language["strict"] for language in done] for name, done in languages.items()},
-        "per_prompt": {
-            name: [language["per_prompt"] for language in done] for name, done in languages.items()
-        },
-    }
-    write_rows(folder, stem, rows, columns)
-    write_json(folder / f"{stem}.json", content)
-    write_comparison(
-        folder / f"{stem}.html",
-        [_with_images(name, done) for name, done in runs.items()],
-        f"lexsplat {'ablate' if stem == 'ablation' else 'compare'}: {bench.capture.root.name}",
-        columns,
-        config={**config, **facts},
-        machine=machine,
-    )
-    return rows
 
 
 def _with_images(name: str, runs: Sequence[MeasuredRun]) -> MeasuredMethod:
