@@ -15,6 +15,7 @@ from lexsplat.features.extraction import cpu_batch, crop_levels, encoded_size, p
 from lexsplat.features.pretrained import resize_images
 from lexsplat.features.pyramid import cut_crops, encode_stream, unique_boxes
 from lexsplat.features.settings import FeatureConfig
+from lexsplat.runtime.device import torch_threads
 from lexsplat.runtime.progress import duration
 
 _SHORT = 0.5  # seconds below which a measurement is repeated with more crops
@@ -54,14 +55,11 @@ def estimate(
         config: Settings of the features.
         capture_size: Width and height of a photo.
     """
-    threads, photos = torch.get_num_threads(), parallel_views(clip.device)
-    torch.set_num_threads(max(1, threads // photos))
-    try:
+    photos = parallel_views(clip.device)
+    with torch_threads(max(1, torch.get_num_threads() // photos)):
         seconds = _crop_seconds(clip, config, capture_size) * count_crops(config, capture_size)
         if dino is not None:
             seconds += _dense_seconds(dino, config, capture_size)
-    finally:
-        torch.set_num_threads(threads)
     return Estimate(count_crops(config, capture_size), seconds / photos)
 
 

@@ -39,6 +39,7 @@ from lexsplat.features.pyramid import (
 )
 from lexsplat.features.settings import GRID_SETTINGS, RANDOM_SETTINGS, FeatureConfig
 from lexsplat.runtime import memory as budget
+from lexsplat.runtime.device import torch_threads
 from lexsplat.runtime.fingerprints import file_hash
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -174,7 +175,12 @@ def cpu_batch(image_size: int) -> int:
 
 def encoded_size(capture_size: tuple[int, int], config: FeatureConfig) -> tuple[int, int]:
     """Width and height at which a photo is cut into crops."""
-    factor = min(1.0, config.max_short_side / min(capture_size))
+    return reduced(capture_size, config.max_short_side)
+
+
+def reduced(capture_size: tuple[int, int], short_side: int) -> tuple[int, int]:
+    """Width and height of a photo whose short side is at most this long."""
+    factor = min(1.0, short_side / min(capture_size))
     return max(1, round(capture_size[0] * factor)), max(1, round(capture_size[1] * factor))
 
 
@@ -273,26 +279,21 @@ class _Extraction:
             return
         for view in missing:
             self._todo.put(view)
-        threads = torch.get_num_threads()
-        inner = max(1, threads // workers)
-        torch.set_num_threads(inner)
-        try:
-            with ThreadPoolExecutor(workers) as pool:
-                futures = [pool.submit(self._work, inner) for _ in range(workers)]
-                try:
-                    running = workers
-                    while running:
-                        finished = self._finished.get()
-                        if finished is None:
-                            running -= 1
-                        else:
-                            yield finished
-                finally:
-                    self._stop.set()  # also when the consumer stops early or is interrupted
-            for future in futures:
-                future.result()
-        finally:
-            torch.set_num_threads(threads)
+        inner = max(1, torch.get_num_threads() // workers)
+        with torch_threads(inner), ThreadPoolExecutor(workers) as pool:
+            futures = [pool.submit(self._work, inner) for _ in range(workers)]
+            try:
+                running = workers
+                while running:
+                    finished = self._finished.get()
+                    if finished is None:
+                        running -= 1
+                    else:
+                        yield finished
+            finally:
+                self._stop.set()  # also when the consumer stops early or is interrupted
+        for future in futures:
+            future.result()
 
     def _work(self, threads: int) -> None:
         torch.set_num_threads(threads)  # the setting is per thread

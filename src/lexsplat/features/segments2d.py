@@ -21,7 +21,7 @@ from torch import Tensor
 
 from lexsplat.features.cache import FeatureMap, FeatureMaps, hash_of, is_stored, read_labels, write_labels
 from lexsplat.features.external import open_npy, segment_numbers, wrong
-from lexsplat.features.extraction import pixels_hash, size_of_map
+from lexsplat.features.extraction import pixels_hash, reduced, size_of_map
 from lexsplat.features.settings import FeatureConfig
 from lexsplat.runtime.errors import FileFormatError, ModelError
 from lexsplat.runtime.fingerprints import file_hash
@@ -109,7 +109,7 @@ class Superpixels:
 
     def key(self, view: View) -> list[Any]:
         """The photo and the settings."""
-        return ["slic", SUPERPIXELS, _COMPACTNESS, pixels_hash(view, _reduced(view.capture_size))]
+        return ["slic", SUPERPIXELS, _COMPACTNESS, pixels_hash(view, reduced(view.capture_size, _SHORT_SIDE))]
 
     def labels(self, view: View, size: tuple[int, int]) -> NDArray[np.int32]:
         """A level for each number of superpixels; see `Segmenter`."""
@@ -117,17 +117,12 @@ class Superpixels:
 
         from lexsplat.captures.images.reading import resize_nearest
 
-        image = view.load_image(_reduced(view.capture_size))
+        image = view.load_image(reduced(view.capture_size, _SHORT_SIDE))
         levels = [
             slic(image, number, compactness=_COMPACTNESS, start_label=0, channel_axis=-1)
             for number in SUPERPIXELS
         ]
         return np.stack([resize_nearest(level, size) for level in levels]).astype(np.int32)
-
-
-def _reduced(capture_size: tuple[int, int]) -> tuple[int, int]:
-    factor = min(1.0, _SHORT_SIDE / min(capture_size))
-    return max(1, round(capture_size[0] * factor)), max(1, round(capture_size[1] * factor))
 
 
 class SegmentFolder:
