@@ -108,22 +108,22 @@ def _check_names(names: list[str], origin: Path) -> None:
     """
     stems: dict[str, str] = {}
     for name in names:
-        twice = stem_of(name) in stems
-        other = stems.setdefault(stem_of(name), name)
-        if twice and other == name:
+        other = stems.get(stem_of(name))
+        if other == name:
             raise CaptureError(
                 origin,
                 expected="every image once",
                 found=f"{name} twice",
                 remedy="remove one of the two from the file",
             )
-        if other != name:
+        if other is not None:
             raise CaptureError(
                 origin,
                 expected="image names that differ in more than their suffix",
                 found=f"{other} and {name}",
                 remedy="rename or remove one of the two",
             )
+        stems[stem_of(name)] = name
 
 
 def _read_camera_files(path: Path, images: Path | None) -> CameraFiles:

@@ -47,8 +47,7 @@ class MethodAnswers:
 
     def chosen(self, index: int) -> Tensor:
         """The Gaussians ``[N]`` bool that reach the threshold of a prompt."""
-        if self.scores is None:
-            raise ValueError("a method without scores of Gaussians selects none")
+        assert self.scores is not None
         return self.scores[index] >= self.thresholds[index]
 
 

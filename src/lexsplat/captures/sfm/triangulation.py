@@ -169,10 +169,7 @@ def random_points_in_frusta(
 
     Raises:
         CaptureError: If an image cannot be read.
-        ValueError: If ``count`` is negative.
     """
-    if count < 0:
-        raise ValueError(f"count must not be negative, got {count}")
     views = capture.train_views
     owners = np.sort(rng.integers(0, len(views), count))
     pixels = rng.random((count, 10, 2))
