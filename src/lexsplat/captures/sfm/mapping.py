@@ -237,8 +237,8 @@ def map_photos(
     with pycolmap.Database.open(database) as opened:
         wrong = misregistered(largest, opened)
     if wrong:
-        options = _mapper_options(mapper, seed)
-        largest = register_again(largest, wrong, database, photos.images, options)
+        again = _mapper_options(mapper, seed)
+        largest = register_again(largest, wrong, database, photos.images, again)
     return Attempt(mapper, largest, len(found))
 
 
