@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.features.extraction import pixels_hash
-from lexsplat.features.hub import model_folder
 from lexsplat.features.pretrained import IMAGENET, PretrainedModel, normalization, precision
 
 if TYPE_CHECKING:
@@ -34,15 +33,6 @@ ALIKE = 0.8
 """IoU from which on two masks of a level are the same."""
 
 _BATCH = 64  # points decoded at once
-
-
-def load_sam2(name: str = DEFAULT_SAM2, device: torch.device | str = "cpu") -> Sam2Segmenter:
-    """A SAM 2 by name or folder.
-
-    Raises:
-        ModelError: If it is not available and cannot be downloaded, or is not a SAM 2.
-    """
-    return Sam2Segmenter(model_folder(name, "segments"), name, device)
 
 
 class Sam2Segmenter(PretrainedModel):

@@ -22,6 +22,7 @@ from torch import Tensor
 from lexsplat.features.cache import FeatureMap, FeatureMaps, hash_of, is_stored, read_labels, write_labels
 from lexsplat.features.external import open_npy, segment_numbers, wrong
 from lexsplat.features.extraction import pixels_hash, reduced, size_of_map
+from lexsplat.features.hub import model_folder
 from lexsplat.features.settings import FeatureConfig
 from lexsplat.runtime.errors import FileFormatError, ModelError
 from lexsplat.runtime.fingerprints import file_hash
@@ -96,9 +97,9 @@ def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
     """
     model = sam2_name(name)
     if model is not None:
-        from lexsplat.features.sam2 import load_sam2
+        from lexsplat.features.sam2 import Sam2Segmenter
 
-        return load_sam2(model, device)
+        return Sam2Segmenter(model_folder(model, "segments"), model, device)
     return Superpixels() if name == "slic" else SegmentFolder(Path(name).expanduser())
 
 
