@@ -23,7 +23,6 @@ from lexsplat.captures import check_ground_truth_options
 from lexsplat.codebook import Codebook, CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.evaluation import (
     EvaluationConfig,
-    GroundTruth,
     GroundTruthSource,
     Method,
     MethodScene,
@@ -303,7 +302,7 @@ class Bench:
             self.capture,
             self._scene_of(language, query),
             self.evaluation,
-            ground_truth=GroundTruth(self.ground_truth.masks, self.ground_truth.boxes),
+            ground_truth=self.ground_truth,
             observer=gallery.add if keep_images else None,
             listener=self.listener,
         ).with_facts(

@@ -12,7 +12,7 @@ size and resizes the ground truth, as the authors do.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
@@ -21,8 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lexsplat.captures.ground_truth.layouts import load_annotations, load_ground_truth
-from lexsplat.evaluation.ground_truth import GroundTruth
+from lexsplat.captures.ground_truth.layouts import Annotations, load_annotations, load_ground_truth
 from lexsplat.evaluation.memory import peak_gpu_memory, peak_memory
 from lexsplat.evaluation.methods import MethodScene
 from lexsplat.evaluation.metrics import (
@@ -81,7 +80,8 @@ def evaluate(
     scene: Scene | MethodScene,
     config: EvaluationConfig | None = None,
     *,
-    ground_truth: GroundTruth | None = None,
+    ground_truth: Annotations | None = None,
+    prompt_kinds: Mapping[str, str] | None = None,
     observer: Callable[[ViewImages], None] | None = None,
     listener: Listener = silent,
 ) -> Metrics:
@@ -91,25 +91,24 @@ def evaluate(
         capture: Photos, cameras and the split.
         scene: What is measured; the fixed threshold is that of its ``query``.
         config: Settings.
-        ground_truth: What the language is measured against; None takes masks and boxes of the capture
-            (`lexsplat.captures.load_annotations`).
+        ground_truth: What the language is measured against; None takes that of the capture
+            (`lexsplat.captures.load_annotations`). Masks of training views are ignored. Where there are no boxes for
+            LangSplat's localization, those of the masks stand in.
+        prompt_kinds: Kind of each prompt ("name", "color", "part", ...); adds the numbers of each kind.
         observer: Receives the images of each held-out view once, for reports.
         listener: Receives progress events.
 
     Returns:
         What was measured; `Metrics.with_facts` adds what is known of build and machine.
     """
-    config = config or EvaluationConfig()
-    if ground_truth is None:
-        found = load_annotations(capture)
-        ground_truth = GroundTruth(found.masks, found.boxes)
+    config, ground_truth = config or EvaluationConfig(), ground_truth or load_annotations(capture)
     listener(Event("evaluate", 0, len(capture.test_names)))
     run = _Evaluation(capture, scene, config, ground_truth)
     quality = run.run(observer, listener)
     words = summarize_language(run.pairs, run.thresholds)
     if words is not None:
         words = {"form": scene.query.form, "method": scene.field.method, **words}
-        words["per_kind"] = summarize_kinds(run.pairs, run.thresholds, ground_truth.prompt_kinds)
+        words["per_kind"] = summarize_kinds(run.pairs, run.thresholds, prompt_kinds or {})
     return Metrics(
         quality=quality,
         language=words,
@@ -136,7 +135,7 @@ class _Evaluation:
         capture: Capture,
         scene: Scene | MethodScene,
         config: EvaluationConfig,
-        ground_truth: GroundTruth,
+        ground_truth: Annotations,
     ) -> None:
         self.capture, self.scene, self.config = capture, scene, config
         masks, self.boxes = ground_truth.masks, ground_truth.boxes

@@ -9,7 +9,7 @@ from typing import Any
 
 from lexsplat.captures.ground_truth.layouts import load_annotations
 from lexsplat.captures.ground_truth.prompt_lists import PromptList
-from lexsplat.evaluation.ground_truth import GroundTruth, GroundTruthSource, read_held_out
+from lexsplat.evaluation.ground_truth import GroundTruthSource, read_held_out
 from lexsplat.evaluation.measuring import EvaluationConfig, evaluate
 from lexsplat.evaluation.protocols import PROTOCOLS
 from lexsplat.evaluation.report.gallery import Gallery
@@ -77,7 +77,8 @@ def evaluate_scene(
         photos,
         scene,
         EvaluationConfig(protocols=tuple(protocols)),
-        ground_truth=GroundTruth(found.masks, found.boxes, _prompt_kinds(photos.root)),
+        ground_truth=found,
+        prompt_kinds=_prompt_kinds(photos.root),
         observer=gallery.add,
         listener=listener,
     ).with_facts(
