@@ -8,7 +8,7 @@ from pathlib import Path
 from shlex import quote
 
 from lexsplat.captures.capture import Capture, View, stem_of
-from lexsplat.captures.ground_truth.layouts import annotated_names, find_annotations
+from lexsplat.captures.ground_truth.layouts import annotated_names
 from lexsplat.captures.images.masks import IGNORE_FOLDER, find_ignore_masks
 from lexsplat.captures.images.reading import IMAGE_SUFFIXES, image_size, sizes_agree
 from lexsplat.captures.images.undistortion import pinhole_of
@@ -62,13 +62,12 @@ def load_capture(
     }
     _check_names([photo.name for photo in files.photos], files.origin)
     root = files.root if beside is None else Path(beside)
-    annotations = find_annotations(root)
     chosen, split_warnings = choose_test_names(
         list(views),
         root=root,
         test_names=test_names,
         listed=files.test_names,
-        annotated=annotated_names(*annotations, views, root / "images") if annotations else (),
+        annotated=annotated_names(root, views),
         test_every=test_every,
     )
     warnings += split_warnings

@@ -75,18 +75,18 @@ class Annotations:
         return Annotations(self.layout, self.origin, change(self.masks), change(self.boxes))
 
 
-def find_annotations(root: Path) -> tuple[str, Path] | None:
-    """Layout and folder of the ground truth that belongs to a capture, or None.
+def find_annotations(root: Path) -> Path | None:
+    """The folder of the ground truth that belongs to a capture, or None.
 
     Masks in ``segmentations/`` of the capture take precedence over LERF-OVS labels in ``label/`` beside it.
     """
     segmentations = root / "segmentations"
     if segmentations.is_dir() and mask_folders(segmentations):
-        return layout_of(segmentations), segmentations
+        return segmentations
     absolute = root.resolve()
     for folder in (absolute.parent / "label" / absolute.name, root / "label" / absolute.name, root / "label"):
         if folder.is_dir() and any(folder.glob("frame_*.json")):
-            return "lerf-ovs", folder
+            return folder
     return None
 
 
@@ -97,13 +97,17 @@ def layout_of(folder: Path) -> str:
     return "3d-ovs" if (folder / CLASSES_FILE).is_file() else "segmentations"
 
 
-def annotated_names(layout: str, folder: Path, names: Collection[str], image_folder: Path) -> set[str]:
-    """Which of the images ``names`` have ground truth. `load_annotations` reports ground truth without an image."""
+def annotated_names(root: Path, names: Collection[str]) -> set[str]:
+    """Which images of a capture have ground truth. `load_annotations` reports ground truth without an image."""
+    folder = find_annotations(root)
+    if folder is None:
+        return set()
+    layout = layout_of(folder)
     if layout == "lerf-ovs":
         stems = [path.stem for path in folder.glob("frame_*.json")]
     else:
         stems = [path.relative_to(folder).as_posix() for path in mask_folders(folder)]
-    found = (_images_meant(stem, layout, names, image_folder) for stem in stems)
+    found = (_images_meant(stem, layout, names, root / "images") for stem in stems)
     return {matches[0] for matches in found if len(matches) == 1}
 
 
@@ -187,13 +191,11 @@ def _with_prompts_of(ground_truth: Annotations, root: Path, prompt_list: PromptL
 
 
 def _read_ground_truth(capture: Capture, folder: Path | None) -> Annotations:
+    folder = folder or find_annotations(capture.root)
     if folder is None:
-        layout, folder = find_annotations(capture.root) or ("segmentations", capture.root / "segmentations")
-    else:
-        layout = layout_of(folder)
-    if layout == "lerf-ovs":
-        return _read_lerf_ovs(capture, folder)
-    return _read_masks(capture, folder, layout)
+        return Annotations("segmentations", capture.root / "segmentations", {})
+    layout = layout_of(folder)
+    return _read_lerf_ovs(capture, folder) if layout == "lerf-ovs" else _read_masks(capture, folder, layout)
 
 
 # Folders of masks
@@ -275,13 +277,10 @@ def _read_lerf_ovs(capture: Capture, folder: Path) -> Annotations:
             if view.lens.distorts:  # the label's box is around the object in the distorted photo
                 box = _box_around(mask)
             parts.setdefault(category, []).append((mask, box))
-        masks[view.name] = {
-            category: np.logical_or.reduce([mask for mask, _ in found])
-            for category, found in sorted(parts.items())
-        }
-        boxes[view.name] = {
-            category: np.stack([box for _, box in found]) for category, found in sorted(parts.items())
-        }
+        masks[view.name], boxes[view.name] = {}, {}
+        for category, found in sorted(parts.items()):
+            masks[view.name][category] = np.logical_or.reduce([mask for mask, _ in found])
+            boxes[view.name][category] = np.stack([box for _, box in found])
     return Annotations("lerf-ovs", folder, masks, boxes)
 
 
