@@ -49,11 +49,9 @@ class Segmenter(Protocol):
 
     def key(self, view: View) -> list[Any]:
         """Everything the segments of a view depend on, as JSON-like values."""
-        ...
 
     def labels(self, view: View, size: tuple[int, int]) -> NDArray[np.int32]:
         """Segments at a width and height ``[L, height, width]``, numbered in each of L levels; -1 for none."""
-        ...
 
 
 def is_folder_of_segments(name: str) -> bool:

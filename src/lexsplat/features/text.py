@@ -34,7 +34,6 @@ class TextTower(Protocol):
 
     def encode_text(self, prompts: Sequence[str]) -> Tensor:
         """Prompts to unit embeddings ``[B, D]``."""
-        ...
 
 
 def load_text(name: str, device: torch.device | str = "cpu") -> TextTower:
