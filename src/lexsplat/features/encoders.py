@@ -15,20 +15,6 @@ from torch import Tensor
 from lexsplat.features.clip import DEFAULT_CLIP, ClipEncoder
 from lexsplat.features.dino import DEFAULT_DINO, DinoEncoder, Facet
 from lexsplat.features.hub import model_folder
-from lexsplat.features.pretrained import resize_images
-
-__all__ = [
-    "DEFAULT_CLIP",
-    "DEFAULT_DINO",
-    "ClipEncoder",
-    "DenseEncoder",
-    "DinoEncoder",
-    "Facet",
-    "ImageTextEncoder",
-    "load_clip",
-    "load_dino",
-    "resize_images",
-]
 
 
 class ImageTextEncoder(Protocol):

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from lexsplat.captures.sfm.feature_budget import check_mapping
-from lexsplat.captures.sfm.preparation import PreparedPhotos, find_photos, photo_folder, prepare_photos
+from lexsplat.captures.sfm.preparation import PreparedPhotos, photo_folder, prepare_photos
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import BackendError, CaptureError
 from lexsplat.runtime.files import atomic_path
@@ -28,7 +28,6 @@ from lexsplat.runtime.progress import Event, FirstUnits, Listener, silent, uncou
 if TYPE_CHECKING:
     from lexsplat.captures.sfm.mapping import Attempt, Mapper
 
-__all__ = ["PhotoPoses", "PoseConfig", "find_photos", "photo_folder", "poses_from_photos"]
 
 STAGE, MATCHING = "poses", "matching"
 EXHAUSTIVE_LIMIT = 80
