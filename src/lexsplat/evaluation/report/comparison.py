@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 
 from lexsplat.evaluation.report.gallery import Gallery
-from lexsplat.evaluation.report.numbers import mean_and_std, number
 from lexsplat.evaluation.report.tables import (
     OTHER_PROTOCOLS,
     REFERENCE_ROWS,
     Row,
     best_rows,
     heading,
+    mean_and_std,
     prompts_worst_first,
     row_cells,
     table_rows,
 )
-from lexsplat.evaluation.report.templating import write_page
+from lexsplat.evaluation.report.templating import number, write_page
 
 MAX_CASES = 40
 """Cases that are shown with the images of all methods, at most; the page states how many were left out."""

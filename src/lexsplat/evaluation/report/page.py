@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from lexsplat.evaluation.report.gallery import Gallery
-from lexsplat.evaluation.report.numbers import number
 from lexsplat.evaluation.report.tables import prompts_worst_first, protocol_rows
-from lexsplat.evaluation.report.templating import write_page
+from lexsplat.evaluation.report.templating import number, write_page
 from lexsplat.evaluation.results import Metrics
 from lexsplat.queries.heatmaps import color_scale
 

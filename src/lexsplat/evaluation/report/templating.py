@@ -19,7 +19,6 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from numpy.typing import NDArray
 from PIL import Image
 
-from lexsplat.evaluation.report.numbers import number, size_text
 from lexsplat.runtime.files import atomic_path
 
 
@@ -87,6 +86,23 @@ def environment() -> Environment:
     }
     found.globals["parts"] = found.get_template("parts.html").module
     return found
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number with a fixed number of decimals; "-" for None and NaN."""
+    return "-" if value is None or value != value else f"{value:.{digits}f}"
+
+
+def size_text(count: int | None) -> str:
+    """A number of bytes in the largest fitting unit (powers of 1000)."""
+    if count is None:
+        return "-"
+    value, unit = float(count), "B"
+    for larger in ("KB", "MB", "GB"):
+        if value < 1000:
+            break
+        value, unit = value / 1000, larger
+    return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
 
 
 def curve_points(curve: Sequence[float] | NDArray[np.float64]) -> str:
