@@ -159,9 +159,7 @@ def check_capture(path: Path) -> None:
     Raises:
         CaptureError: With what is there instead.
     """
-    if path.is_file() or is_photo_folder(path):
-        return
-    if not path.is_dir() or (find_model(path) is None and find_transforms(path) is None):
+    if not (path.is_file() or is_photo_folder(path) or _has_cameras(path)):
         _read_camera_files(path, None)
 
 
@@ -170,12 +168,11 @@ def is_photo_folder(path: Path) -> bool:
 
     A video counts as such a folder of frames.
     """
-    return is_video(path) or (
-        path.is_dir()
-        and find_model(path) is None
-        and find_transforms(path) is None
-        and bool(_photos_of(path))
-    )
+    return is_video(path) or (path.is_dir() and not _has_cameras(path) and bool(_photos_of(path)))
+
+
+def _has_cameras(path: Path) -> bool:
+    return find_model(path) is not None or find_transforms(path) is not None
 
 
 def _photos_of(path: Path) -> list[Path]:
