@@ -119,7 +119,7 @@ def write_comparison(
     write_page(path, "comparison.html", content, views)
 
 
-def _cards(methods: Sequence[MeasuredMethod], rows: Sequence[Row]) -> list[dict[str, str]]:
+def _cards(methods: Sequence[MeasuredMethod], rows: Sequence[Row]) -> list[tuple[str, str, str]]:
     """The best values with the names of their methods, and how much was measured."""
     facts = []
     for key, name in (("mIoU", "best mIoU"), ("mAP", "best mAP"), ("mIoU_oracle", "best oracle mIoU")):
@@ -131,22 +131,17 @@ def _cards(methods: Sequence[MeasuredMethod], rows: Sequence[Row]) -> list[dict[
     views = {view for method in methods for view in method.cases}
     if prompts:
         facts += [("prompts", str(len(prompts)), ""), ("held-out views", str(len(views)), "")]
-    return [dict(zip(("name", "value", "note"), fact)) for fact in facts]
+    return facts
 
 
 def _table(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, Any]:
     """Headings and rows of cells; the best value of a column is marked."""
     shown, texts = row_cells(rows, keys)
-    best = {key: best_rows(rows, key) for key in shown}
+    best = [best_rows(rows, key) for key in shown]
+    cells = [[(text, i in marked) for text, marked in zip(line, best)] for i, line in enumerate(texts)]
     return {
         "headings": [heading(key) for key in shown],
-        "rows": [
-            {
-                "name": str(row["name"]),
-                "cells": [{"text": text, "best": index in best[key]} for key, text in zip(shown, line)],
-            }
-            for index, (row, line) in enumerate(zip(rows, texts))
-        ],
+        "rows": list(zip([row["name"] for row in rows], cells)),
     }
 
 

@@ -28,8 +28,8 @@ def write_page(path: Path, template: str, content: Mapping[str, Any], views: Map
     Args:
         path: The file.
         template: File name in ``templates/``.
-        content: Variables of the template, with "title", "subtitle", "cards" (dictionaries of "name", "value" and
-            "note"), "shown_views" (names of ``views`` whose images the page contains), "config" and "machine".
+        content: Variables of the template, with "title", "subtitle", "cards" (names, values and notes), "shown_views"
+            (names of ``views`` whose images the page contains), "config" and "machine".
         views: ``{view: {"photo" | "render": JPEG}}``.
     """
     rendered = (
