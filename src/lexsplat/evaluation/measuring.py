@@ -217,34 +217,21 @@ class _Evaluation:
         }
 
         def measured(prompt: str) -> PairResult:
-            maps = relevancy[prompt], working[prompt], ground_truth[prompt]
-            return self._pair(view, prompt, *maps, silhouettes.get(prompt))
+            found, mask, thresholds = relevancy[prompt], ground_truth[prompt], self.thresholds[prompt]
+            boxes, asked = self.boxes.get(view.name, {}).get(prompt), self.config.protocols
+            return PairResult(
+                threshold_counts(found, mask),
+                mask_scores(found >= thresholds["auto"], mask),
+                average_precision(found, mask),
+                localization(found, mask),
+                official_scores(working[prompt], mask, thresholds["fixed"]) if "official" in asked else None,
+                lerf_2d_scores(found, mask, boxes) if "lerf-2d" in asked and mask.any() else None,
+                silhouettes.get(prompt),
+            )
 
         with ThreadPoolExecutor(kernel_threads()) as pool:  # counting and sorting release the GIL
             self.pairs[view.name] = dict(zip(ground_truth, pool.map(measured, ground_truth)))
         return relevancy, ground_truth
-
-    def _pair(
-        self,
-        view: View,
-        prompt: str,
-        relevancy: NDArray[np.float32],
-        working: NDArray[np.float32],
-        mask: NDArray[np.bool_],
-        silhouette: float | None,
-    ) -> PairResult:
-        """One prompt in one view: ``relevancy`` at the size of the ground truth, ``working`` at the working size."""
-        asked, thresholds = self.config.protocols, self.thresholds[prompt]
-        boxes = self.boxes.get(view.name, {}).get(prompt)
-        return PairResult(
-            threshold_counts(relevancy, mask),
-            mask_scores(relevancy >= thresholds["auto"], mask),
-            average_precision(relevancy, mask),
-            localization(relevancy, mask),
-            official_scores(working, mask, thresholds["fixed"]) if "official" in asked else None,
-            lerf_2d_scores(relevancy, mask, boxes) if "lerf-2d" in asked and mask.any() else None,
-            silhouette,
-        )
 
     @torch.no_grad()
     def _silhouette(self, camera: Camera, prompt: str, mask: NDArray[np.bool_]) -> float:
