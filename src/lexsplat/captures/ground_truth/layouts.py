@@ -15,7 +15,7 @@ import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -284,22 +284,18 @@ def _read_lerf_ovs(capture: Capture, folder: Path) -> Annotations:
     return Annotations("lerf-ovs", folder, masks, boxes)
 
 
-class _LabeledObject(NamedTuple):
-    """One object of a label file: category, box ``[4]`` and polygon ``[n, 2]``, in pixels."""
-
-    category: str
-    box: NDArray[np.float64]
-    polygon: NDArray[np.float64]
+_Object = tuple[str, NDArray[np.float64], NDArray[np.float64]]
+"""One object of a label file: category, box ``[4]`` and polygon ``[n, 2]``, in pixels."""
 
 
-def _read_labels(path: Path) -> tuple[str, tuple[int, int], list[_LabeledObject]]:
+def _read_labels(path: Path) -> tuple[str, tuple[int, int], list[_Object]]:
     """Name, width and height of the image of a label file, and the objects."""
     content = read_json(path, remedy="copy the file again or correct it")
     try:
         info = content["info"]
         name, size = str(info["name"]), (int(info["width"]), int(info["height"]))
         objects = [
-            _LabeledObject(
+            (
                 str(entry["category"]),
                 np.asarray(entry["bbox"], dtype=np.float64).reshape(4),
                 np.asarray(entry["segmentation"], dtype=np.float64).reshape(-1, 2),
@@ -313,7 +309,7 @@ def _read_labels(path: Path) -> tuple[str, tuple[int, int], list[_LabeledObject]
             found=repr(error)[:200],
             remedy="use LangSplat's label files",
         ) from error
-    numbers = [part for found in objects for part in (found.box, found.polygon)]
+    numbers = [part for _, *parts in objects for part in parts]
     if min(size) < 1 or max(size) > MAX_SIDE or size[0] * size[1] > MAX_PIXELS:
         raise FileFormatError(
             path, expected="a size and finite coordinates", found=f"size {size[0]}x{size[1]}"[:60]

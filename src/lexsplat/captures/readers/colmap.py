@@ -15,7 +15,7 @@ import re
 import struct
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,16 +67,16 @@ def read_colmap(root: Path, model: Path, images: Path | None = None) -> CameraFi
     if not images_file.is_file():
         raise _damaged(images_file, "the model's images", "no such file")
     entries = list(_read_images(images_file))
-    names = [checked_name(entry.name, images_file) for entry in entries]
+    names = [checked_name(name, images_file) for name, _, _ in entries]
     folder = _image_folder(root, names) if images is None else images
     photos, missing = [], []
-    for name, entry in zip(names, entries):
-        if entry.camera_id not in lenses:
-            expected = f"camera {entry.camera_id} of image {name} in cameras{suffix}"
+    for name, (_, camera_id, pose) in zip(names, entries):
+        if camera_id not in lenses:
+            expected = f"camera {camera_id} of image {name} in cameras{suffix}"
             raise _damaged(images_file, expected, f"cameras {sorted(lenses)[:8]}")
-        viewmat = _viewmat(entry.quaternion, entry.translation, name, images_file)
+        viewmat = _viewmat(pose, name, images_file)
         if (folder / name).is_file():
-            photos.append(Photo(name, folder / name, lenses[entry.camera_id], viewmat))
+            photos.append(Photo(name, folder / name, lenses[camera_id], viewmat))
         else:
             missing.append(name)
     found = CameraFiles(root=root, origin=model, photos=photos, missing=missing)
@@ -103,14 +103,12 @@ def _image_folder(root: Path, names: list[str]) -> Path:
     return max(folders, key=lambda folder: sum((folder / name).is_file() for name in names))
 
 
-def _viewmat(
-    quaternion: tuple[float, ...], translation: tuple[float, ...], name: str, origin: Path
-) -> NDArray[np.float64]:
+def _viewmat(pose: tuple[float, ...], name: str, origin: Path) -> NDArray[np.float64]:
     """World to camera ``[4, 4]`` from COLMAP's quaternion (wxyz, normalized here) and translation."""
     viewmat = np.eye(4)
     with np.errstate(all="ignore"):  # damaged numbers overflow here; the check below names the image
-        viewmat[:3, :3] = matrix_from_quaternion(np.array(quaternion))
-    viewmat[:3, 3] = translation
+        viewmat[:3, :3] = matrix_from_quaternion(np.array(pose[:4]))
+    viewmat[:3, 3] = pose[4:]
     return checked_pose(viewmat, name, origin)
 
 
@@ -183,14 +181,8 @@ _OBSERVATION_BYTES = 24  # x, y, point id
 _TRACK_BYTES = 8  # image id, observation index
 
 
-@dataclass(frozen=True)
-class _ImageEntry:
-    """An image of a model: its name, its camera, and its pose, world to camera."""
-
-    name: str
-    camera_id: int
-    quaternion: tuple[float, ...]  # wxyz
-    translation: tuple[float, ...]
+_Image = tuple[str, int, tuple[float, ...]]
+"""Name, camera and pose of an image: world to camera, quaternion (wxyz) and translation."""
 
 
 def _read_cameras(file: Path) -> Iterator[tuple[int, Lens]]:
@@ -221,7 +213,7 @@ def _read_cameras(file: Path) -> Iterator[tuple[int, Lens]]:
     content.finish()
 
 
-def _read_images(file: Path) -> Iterator[_ImageEntry]:
+def _read_images(file: Path) -> Iterator[_Image]:
     if file.suffix == ".txt":
         yield from _read_images_text(file)
         return
@@ -231,11 +223,11 @@ def _read_images(file: Path) -> Iterator[_ImageEntry]:
         name = content.text("an image name")
         observations = content.count(_OBSERVATION_BYTES, f"observations of {name[:60]}")
         content.skip(observations * _OBSERVATION_BYTES, f"observations of {name[:60]}")
-        yield _ImageEntry(name, camera_id, tuple(pose[:4]), tuple(pose[4:]))
+        yield name, camera_id, tuple(pose)
     content.finish()
 
 
-def _read_images_text(file: Path) -> Iterator[_ImageEntry]:
+def _read_images_text(file: Path) -> Iterator[_Image]:
     lines = _lines(file)
     for line in _records(file, lines):
         words = line.strip().split(maxsplit=9)
@@ -249,7 +241,7 @@ def _read_images_text(file: Path) -> Iterator[_ImageEntry]:
         if observations is None or not _are_observations(observations):
             instead = "the end of the file" if observations is None else repr(observations[:60])
             raise _damaged(file, f"a line of observations after image {name}", instead)
-        yield _ImageEntry(name, camera_id, pose[:4], pose[4:])
+        yield name, camera_id, pose
 
 
 def _are_observations(line: str) -> bool:
