@@ -36,11 +36,8 @@ class LexsplatError(Exception):
         super().__init__(str(self))
 
     def __str__(self) -> str:
-        clauses = []
-        if self.expected:
-            clauses.append(f"expected {self.expected}")
-        if self.found:
-            clauses.append(f"found {self.found}")
+        sides = (("expected", self.expected), ("found", self.found))
+        clauses = [f"{word} {text}" for word, text in sides if text]
         message = ": ".join(part for part in (self.subject, ", ".join(clauses)) if part)
         if self.remedy:
             message = f"{message}; {self.remedy}"
