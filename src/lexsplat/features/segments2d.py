@@ -24,7 +24,7 @@ from lexsplat.features.external import open_npy, segment_numbers, wrong
 from lexsplat.features.extraction import pixels_hash, reduced, size_of_map
 from lexsplat.features.hub import model_folder
 from lexsplat.features.settings import FeatureConfig
-from lexsplat.runtime.errors import FileFormatError, ModelError
+from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.fingerprints import file_hash
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -209,12 +209,9 @@ def check_segments(config: FeatureConfig, capture: Capture) -> None:
             found = len(folder.labels(view, size_of_map(view.capture_size, config)))
             levels = levels or found
             if found != levels:
-                raise FileFormatError(
-                    folder.path(view),
-                    expected=f"{_count(levels)}, as {capture.train_views[0].stem} has",
-                    found=_count(found),
-                    remedy="give each photo the same levels of segments, in one order",
-                )
+                expected = f"{_count(levels)}, as {capture.train_views[0].stem} has"
+                remedy = "give each photo the same levels of segments, in one order"
+                raise wrong(folder.path(view), expected, _count(found), remedy)
 
 
 def _count(levels: int) -> str:
