@@ -44,7 +44,8 @@ class MethodAnswers:
 
     def chosen(self, index: int) -> Tensor:
         """The Gaussians ``[N]`` bool that reach the threshold of a prompt."""
-        assert self.scores is not None
+        if self.scores is None:
+            raise ValueError("a method without scores of Gaussians selects none")
         return self.scores[index] >= self.thresholds[index]
 
 

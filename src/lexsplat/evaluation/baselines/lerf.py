@@ -71,7 +71,8 @@ def physical_scales(views: TrainingViews, level_maps: LevelMaps, count: int) -> 
 def _depth(views: TrainingViews, name: str) -> Tensor:
     camera, prepared = views.prepared(name)
     depth = render(views.gaussians, camera, color=False, depth=True, prepared=prepared).depth
-    assert depth is not None
+    if depth is None:
+        raise ValueError("the backend renders no depth")
     return depth
 
 
