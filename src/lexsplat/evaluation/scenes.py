@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +67,10 @@ def evaluate_scene(
     folder.refuse_bundled()
     photos = reload_capture(folder, capture)
     if not photos.test_names:
-        log.warning(
-            "%s: no held-out views: neither images nor language are measured; %s", folder.root, _way(record)
-        )
+        way = "build it with --test-every or --test-views"
+        if is_of_chosen_views(record):
+            way = "views of splats are no ground truth, so give lexsplat language the photos, too"
+        log.warning("%s: no held-out views: neither images nor language are measured; %s", folder.root, way)
     source = GroundTruthSource(masks, prompt_list)
     found = load_annotations(photos) if source == GroundTruthSource() else read_held_out(photos, source)
     gallery = Gallery()
@@ -108,13 +109,6 @@ def evaluate_scene(
             temporary.write_bytes(images["heatmap"])
     listener(Event("report", len(gallery.views), len(gallery.views)))
     return result
-
-
-def _way(record: Mapping[str, Any]) -> str:
-    """How a scene gets held-out views."""
-    if is_of_chosen_views(record):
-        return "views of splats are no ground truth, so give lexsplat language the photos, too"
-    return "build it with --test-every or --test-views"
 
 
 def _prompt_kinds(root: Path) -> dict[str, str]:

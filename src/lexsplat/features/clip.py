@@ -216,10 +216,8 @@ def _load_tokenizer(folder: Path, name: str, config: Any) -> Any:
     except Exception as error:  # tokenizers raise a different type for each missing file
         found, remedy = str(error)[:120], "fetch it again"
         if list(folder.glob("*.model")) and not all(map(_is_installed, ("sentencepiece", "google.protobuf"))):
-            found, remedy = (
-                "one of SentencePiece, which is not installed",
-                'run: pip install "lexsplat[siglip]"',
-            )
+            found = "one of SentencePiece, which is not installed"
+            remedy = 'run: pip install "lexsplat[siglip]"'
         raise refusal(expected="a tokenizer beside the weights", found=found, remedy=remedy) from error
     tokenizer.padding_side = "right"  # as in training; transformers' default for SigLIP 2 is "left"
     if not is_vocabulary(len(tokenizer), size):

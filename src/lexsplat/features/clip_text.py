@@ -163,10 +163,8 @@ class ClipText:
         self.device = torch.device(device)
         self._heads, self._layers = settings["num_attention_heads"], settings["num_hidden_layers"]
         self._epsilon, self._end = settings["layer_norm_eps"], settings["eos_token_id"]
-        self._limit, self._activation = (
-            settings["max_position_embeddings"],
-            _ACTIVATIONS[settings["hidden_act"]],
-        )
+        self._limit = settings["max_position_embeddings"]
+        self._activation = _ACTIVATIONS[settings["hidden_act"]]
         # Copies, because tensors in a file are not aligned, and alignment affects the rounding of sums.
         self._weights = {
             re.sub(r"^text_model\.", "", name): value.to(self.device, torch.float32, copy=True)

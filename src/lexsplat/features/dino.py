@@ -42,11 +42,9 @@ class DinoEncoder(PretrainedModel):
         self._caught = threading.local()  # each thread that evaluates the model captures its own keys
         for projection in self._keys:
             projection.register_forward_hook(self._catch)
-        self._options: dict[str, Any] = {}
-        if "interpolate_pos_encoding" in inspect.signature(self._model.forward).parameters:
-            self._options["interpolate_pos_encoding"] = (
-                True  # the others interpolate always, or use rotary positions
-            )
+        # Models that do not take this option interpolate always, or use rotary positions.
+        taken = inspect.signature(self._model.forward).parameters
+        self._options = {name: True for name in ("interpolate_pos_encoding",) if name in taken}
 
     @torch.inference_mode()
     def encode_dense(

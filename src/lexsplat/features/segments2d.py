@@ -254,9 +254,8 @@ def pooled_features(
     for done, name in enumerate(maps, start=1):
         view = capture.views[name]
         size = size_of_map(view.capture_size, config)
-        paths[name] = (
-            Path(cache_dir) / f"{hash_of('segments', segmenter.key(view), size)}.segments.safetensors"
-        )
+        key = hash_of("segments", segmenter.key(view), size)
+        paths[name] = Path(cache_dir) / f"{key}.segments.safetensors"
         if not is_stored(paths[name]):
             write_labels(paths[name], segmenter.labels(view, size))
         listener(Event("2D segments", done, len(maps)))

@@ -121,11 +121,8 @@ class TextCache:
             if any(len(vector) != vectors.shape[1] for vector in found.values()):
                 new, vectors = wanted, encode_each(model, wanted, listener)
             found.update(zip(new, vectors))
-        in_order = {
-            prompt: found[prompt] for prompt in wanted
-        }  # so that files do not depend on what was known
-        for store in self._written:
-            store.add(content_hash, in_order)
+        for store in self._written:  # in one order, so that files do not depend on what was known
+            store.add(content_hash, {prompt: found[prompt] for prompt in wanted})
         return torch.stack([found[prompt] for prompt in prompts])
 
 

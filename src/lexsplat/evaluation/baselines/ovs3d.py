@@ -78,14 +78,10 @@ class ClassFeatures:
     def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
         """Maps ``[P, H, W]``: each prompt against the best other class; the negatives have no part."""
         (positives,) = unit_texts(question.positives)
-        cosines, alpha = render_cosines(
-            gaussians, camera, self.features, torch.cat([positives, self.classes.to(positives)])
-        )
-        return (
-            (self._against_others(cosines, positives, question.config) * alpha[..., None])
-            .permute(2, 0, 1)
-            .contiguous()
-        )
+        texts = torch.cat([positives, self.classes.to(positives)])
+        cosines, alpha = render_cosines(gaussians, camera, self.features, texts)
+        found = self._against_others(cosines, positives, question.config) * alpha[..., None]
+        return found.permute(2, 0, 1).contiguous()
 
     def gaussian_scores(self, question: Question) -> Tensor | None:
         """Scores ``[P, N]``."""

@@ -32,20 +32,14 @@ def write_page(path: Path, template: str, content: Mapping[str, Any], views: Map
             (names of ``views`` whose images the page contains), "config" and "machine".
         views: ``{view: {"photo" | "render": JPEG}}``.
     """
-    rendered = (
-        environment()
-        .get_template(template)
-        .render(
-            {
-                **content,
-                "views": views,
-                "view_index": {view: index for index, view in enumerate(views)},
-                "provenance": _provenance(content["config"], content["machine"]),
-                "documents": {name: content[name] for name in ("machine", "config")},
-            }
-        )
-    )
-    write_text(path, rendered)
+    variables = {
+        **content,
+        "views": views,
+        "view_index": {view: index for index, view in enumerate(views)},
+        "provenance": _provenance(content["config"], content["machine"]),
+        "documents": {name: content[name] for name in ("machine", "config")},
+    }
+    write_text(path, environment().get_template(template).render(variables))
 
 
 def write_text(path: Path, text: str) -> None:
