@@ -112,7 +112,7 @@ def _tokenizer(path: Path, size: int) -> Any:
 
 
 def is_vocabulary(words: int, size: int) -> bool:
-    """Whether a tokenizer of so many words belongs to a model of ``size``: a multiple of 128 at most."""
+    """Whether a tokenizer of so many words belongs to a model of ``size``, padded to a multiple of at most 128."""
     return size - 128 < words <= size
 
 
