@@ -41,8 +41,8 @@ from typing import Any
 import numpy as np
 from records import REPOSITORY, RESULTS, argument_parser, commit
 
-from lexsplat.evaluation.report.numbers import number
 from lexsplat.evaluation.report.tables import best_rows, heading, row_cells, table_rows
+from lexsplat.evaluation.report.templating import number
 from lexsplat.runtime.files import atomic_path, read_json, write_json
 
 PAGE = REPOSITORY / "docs" / "results.md"

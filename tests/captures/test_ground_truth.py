@@ -145,7 +145,7 @@ def test_3d_ovs_is_read_with_its_class_list(ovs3d):
     assert capture.test_names == ("00.jpg", "03.jpg")
     found = load_annotations(capture)
     assert found.layout == "3d-ovs"
-    assert found.classes == ("mini offroad car", "wall")
+    assert found.prompts() == ("mini offroad car", "wall")
     assert list(found.masks) == ["00.jpg", "03.jpg"]
     total = sum(load_ground_truth(capture.views["03.jpg"], mask) for mask in found.masks["03.jpg"].values())
     np.testing.assert_array_equal(total, 1)

@@ -34,7 +34,6 @@ class TestTransforms:
             np.testing.assert_allclose(view.camera.viewmat, camera.viewmat, atol=1e-9)
             np.testing.assert_allclose(view.camera.K, [[FOCAL, 0, 32], [0, FOCAL, 24], [0, 0, 1]])
             assert view.capture_size == (WIDTH, HEIGHT)
-        assert capture.source == "transforms"
         assert capture.points.shape == (0, 3)
         positions = np.array([view.camera.position for view in capture.train_views])
         assert capture.extent == pytest.approx(
@@ -369,8 +368,8 @@ class TestMasks:
 def test_colmap_is_preferred_because_it_has_points(tmp_path):
     write_transforms(tmp_path, NAMES[:3])
     write_colmap(tmp_path, NAMES[:3])
-    assert load_capture(tmp_path).source == "colmap"
-    assert load_capture(tmp_path / "transforms.json").source == "transforms"
+    assert len(load_capture(tmp_path).points)
+    assert not len(load_capture(tmp_path / "transforms.json").points)
 
 
 def test_stems_keep_folders_and_dots():

@@ -22,8 +22,7 @@ from support.written_captures import save
 from lexsplat.captures import PoseConfig, load_capture, poses_from_photos
 from lexsplat.captures.sfm import counting, mapping, photos
 from lexsplat.captures.sfm.mapping import Attempt
-from lexsplat.captures.sfm.photos import find_photos
-from lexsplat.captures.sfm.preparation import prepare_photos, turned_upright
+from lexsplat.captures.sfm.preparation import find_photos, prepare_photos, turned_upright
 from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
 from lexsplat.geometry.cameras import look_at
 from lexsplat.runtime.errors import CaptureError

@@ -9,7 +9,6 @@ from PIL import Image, ImageFilter
 from support.refusals import assert_reports
 
 from lexsplat.captures.readers.video import (
-    FrameMeasures,
     choose_frames,
     is_video,
     measure_frames,
@@ -76,7 +75,7 @@ def test_blurred_frames_are_skipped_and_the_count_is_exact(video, tmp_path):
 
 
 def test_frames_follow_the_motion_and_not_the_time(video):
-    chosen = choose_frames(measure_frames(video), 12)
+    chosen = choose_frames(*measure_frames(video), 12)
     fast = sum(index >= 30 for index in chosen)
     assert fast >= 8, "five sixths of the way lie in the second half of the time"
     steps = np.diff(positions()[chosen])
@@ -99,12 +98,12 @@ def test_a_jump_gets_no_more_frames_than_there_are_and_gaps_are_filled():
     motion = np.ones(40)
     motion[0], motion[20] = 0, 60  # a cut: most segments of equal motion have no frame
     sharpness = np.where(np.arange(40) % 2, 2.0, 1.0)
-    chosen = choose_frames(FrameMeasures(sharpness, motion), 10)
+    chosen = choose_frames(sharpness, motion, 10)
     assert len(set(chosen)) == 10
     assert chosen == sorted(chosen)
     assert sum(index < 20 for index in chosen) in range(3, 8)
-    assert choose_frames(FrameMeasures(sharpness, motion), 100) == list(range(40))
-    still = choose_frames(FrameMeasures(sharpness, np.zeros(40)), 8)
+    assert choose_frames(sharpness, motion, 100) == list(range(40))
+    still = choose_frames(sharpness, np.zeros(40), 8)
     assert len(still) == 8
     assert np.diff(still).max() <= 10, "where nothing moves, time decides"
 

@@ -83,8 +83,14 @@ def pixel_accuracy(method, balls, maps_shape=(24, 32)):
 # Full-dimensional features
 
 
+def training_data(balls, maps=None):
+    """Data for methods that need no crop sizes; without maps, views have some of 16x12 cells."""
+    maps = maps or {name: FeatureMap(torch.zeros(12, 16, 1)) for name in balls.cameras}
+    return TrainingData(balls.gaussians, balls.cameras, maps, level_maps=None)
+
+
 def test_back_projection_is_the_transpose_of_rendering(balls):
-    views = TrainingViews(balls.gaussians, balls.cameras, lambda name: (16, 12))
+    views = TrainingViews(training_data(balls))
     camera, prepared = views.prepared("view0")
     weights = render(balls.gaussians, camera, features=torch.eye(len(balls.gaussians)), color=False).features
     values = torch.randn(camera.height, camera.width, 70, generator=torch.Generator().manual_seed(0))
@@ -94,11 +100,11 @@ def test_back_projection_is_the_transpose_of_rendering(balls):
 
 
 def test_the_mean_of_a_constant_is_that_constant_where_a_gaussian_was_seen(balls):
-    views = TrainingViews(balls.gaussians, balls.cameras, lambda name: (16, 12), scale=2)
+    views = TrainingViews(training_data(balls), scale=2)
     events = []
     constant = torch.tensor([0.25, -1.0])
     features, weights = back_projected_mean(
-        views, lambda name, camera: constant.expand(camera.height, camera.width, 2), listener=events.append
+        views, lambda name: constant.expand(24, 32, 2), listener=events.append
     )
     assert events == [1, 2, 3, 4, 5, 6]
     seen = weights >= 0.01
@@ -123,7 +129,7 @@ def test_cosines_in_chunks_are_those_of_the_whole_feature(balls):
 
 
 def test_distilled_features_find_the_balls(balls, maps):
-    data = TrainingData(balls.gaussians, balls.cameras, maps)
+    data = training_data(balls, maps)
     found = Dff(DffConfig(steps=20)).fit(data, BaselineRun({}))
     assert isinstance(found, Method)
     assert ball_scores(found, balls) > 0.85
@@ -145,7 +151,7 @@ def test_distilling_moves_from_the_mean_towards_the_least_squares_solution_and_i
     def error(features):
         return float((system @ features.double() - target).square().mean())
 
-    data = TrainingData(balls.gaussians, balls.cameras, noisy)
+    data = training_data(balls, noisy)
     average = Dff(DffConfig(steps=0)).fit(data, BaselineRun({}))
     fitted = Dff(DffConfig(steps=40, learning_rate=0.05)).fit(data, BaselineRun({}))
     left = (error(fitted.features[0]) - error(best)) / (error(average.features[0]) - error(best))

@@ -161,8 +161,8 @@ def test_baselines_receive_a_quarter_of_the_memory(compared, tiny_capture, tmp_p
     granted, original = [], feature_rendering.TrainingViews.__init__
 
     def keep(*args, **wishes):
-        granted.append(wishes["memory"])
         original(*args, **wishes)
+        granted.append(args[0]._limit)
 
     monkeypatch.setattr(feature_rendering.TrainingViews, "__init__", keep)
     config = replace(CONFIG, memory="800MB")

@@ -12,10 +12,9 @@ import pytest
 import torch
 from support.tiny_capture import SPHERES, trace
 
-from lexsplat.captures import Capture, load_annotations, load_capture
+from lexsplat.captures import Annotations, Capture, load_annotations, load_capture
 from lexsplat.evaluation import (
     EvaluationConfig,
-    GroundTruth,
     MethodScene,
     Metrics,
     PairResult,
@@ -49,6 +48,10 @@ def things_at(pose, focal, width, height):
 def things_seen(camera):
     """Index of the thing at every pixel ``[H, W]``, by ray tracing."""
     return things_at(camera.viewmat.tobytes(), camera.K[0, 0], camera.width, camera.height)
+
+
+def drawn(masks, boxes=None):
+    return Annotations("segmentations", Path(), masks, boxes or {})
 
 
 QUICK = EvaluationConfig(timing_views=1, lpips=False, protocols=("strict", "official", "lerf-2d"))
@@ -142,7 +145,7 @@ def test_a_field_that_confuses_two_things_scores_zero(capture, gaussians):
 
 def test_relevancy_is_rendered_at_the_size_of_the_truth(capture, gaussians):
     field = PerfectField()
-    subject, ground_truth = traced(capture, gaussians, field), GroundTruth(larger_masks(capture, 3))
+    subject, ground_truth = traced(capture, gaussians, field), drawn(larger_masks(capture, 3))
     metrics = evaluate(capture, subject, QUICK, ground_truth=ground_truth)
     assert (288, 216) in field.sizes
     assert metrics.language["strict"]["auto"]["mIoU"] == pytest.approx(1)
@@ -154,7 +157,7 @@ def test_relevancy_is_rendered_at_the_size_of_the_truth(capture, gaussians):
 def test_masks_larger_than_allowed_are_met_by_an_enlarged_map(capture, gaussians):
     field = PerfectField()
     config = replace(QUICK, max_pixels=96 * 72)
-    subject, ground_truth = traced(capture, gaussians, field), GroundTruth(larger_masks(capture, 3))
+    subject, ground_truth = traced(capture, gaussians, field), drawn(larger_masks(capture, 3))
     metrics = evaluate(capture, subject, config, ground_truth=ground_truth)
     assert set(field.sizes) == {(96, 72)}
     assert 0.85 < metrics.language["strict"]["oracle"]["mIoU"] < 1
@@ -166,7 +169,7 @@ def test_automatic_thresholds_never_see_the_truth(capture, gaussians, perfect):
         for view, prompts in zip(capture.test_views, larger_masks(capture, 1).values())
     }
     subject = traced(capture, gaussians)
-    misled = evaluate(capture, subject, QUICK, ground_truth=GroundTruth(wrong))
+    misled = evaluate(capture, subject, QUICK, ground_truth=drawn(wrong))
     for prompt in WORDS:
         assert misled.thresholds[prompt]["auto"] == perfect.thresholds[prompt]["auto"]
     assert misled.language["strict"]["auto"]["mIoU"] == 0
@@ -195,11 +198,11 @@ def test_the_automatic_mask_is_that_of_the_threshold_itself():
 def test_masks_of_training_views_do_not_count(capture, gaussians):
     masks = {capture.train_names[0]: {"red apple": np.ones((72, 96), bool)}}
     subject = traced(capture, gaussians)
-    assert evaluate(capture, subject, QUICK, ground_truth=GroundTruth(masks)).language is None
+    assert evaluate(capture, subject, QUICK, ground_truth=drawn(masks)).language is None
 
 
 def test_without_masks_images_are_measured_alone(capture, gaussians):
-    metrics = evaluate(capture, traced(capture, gaussians), QUICK, ground_truth=GroundTruth({}))
+    metrics = evaluate(capture, traced(capture, gaussians), QUICK, ground_truth=drawn({}))
     assert metrics.language is None
     assert metrics.speed["query_ms"] is None
     assert metrics.speed["rgb_fps"] > 0
@@ -229,7 +232,7 @@ def test_observers_see_every_view_once(capture, gaussians):
 
 def test_progress_is_reported(capture, gaussians):
     events = []
-    evaluate(capture, traced(capture, gaussians), QUICK, ground_truth=GroundTruth({}), listener=events.append)
+    evaluate(capture, traced(capture, gaussians), QUICK, ground_truth=drawn({}), listener=events.append)
     assert [(event.stage, event.done, event.total) for event in events] == [
         ("evaluate", i, 3) for i in (0, 1, 2, 3)
     ]
@@ -405,7 +408,7 @@ def test_lerf_3d_scores_what_is_selected_in_space_and_any_method_can_be_measured
 
 def test_boxes_of_the_annotation_decide_about_localization(capture, gaussians):
     elsewhere = {v: {p: np.array([[0.0, 0.0, 1.0, 1.0]]) for p in WORDS} for v in capture.test_names}
-    ground_truth = GroundTruth(load_annotations(capture).masks, elsewhere)
+    ground_truth = drawn(load_annotations(capture).masks, elsewhere)
     subject = traced(capture, gaussians)
     right = evaluate(capture, subject, QUICK).language["lerf_2d"]
     wrong = evaluate(capture, subject, QUICK, ground_truth=ground_truth).language["lerf_2d"]

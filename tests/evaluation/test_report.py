@@ -10,7 +10,6 @@ from support.report_pages import NASTY, Page, evaluated
 
 from lexsplat.evaluation import Metrics
 from lexsplat.evaluation.report import (
-    Comparison,
     Gallery,
     MeasuredMethod,
     format_rows,
@@ -159,7 +158,7 @@ def test_the_headline_of_a_comparison_names_the_best_method_and_never_the_refere
     results = {"<b>trained</b>": [worst], "averaged": [middle], "nearest": [best]}
     methods = [MeasuredMethod(name, runs) for name, runs in results.items()]
     path = tmp_path / "any name.html"
-    write_comparison(path, Comparison(methods, title="<i>title</i>"))
+    write_comparison(path, methods, "<i>title</i>", config={}, machine={})
     text = path.read_text(encoding="utf-8")
     page = Page(text)
     assert "".join(page.text).count("<i>title</i>") == 2

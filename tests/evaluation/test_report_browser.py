@@ -5,7 +5,7 @@ import shutil
 import pytest
 from support.report_pages import evaluated
 
-from lexsplat.evaluation.report import Comparison, MeasuredMethod, write_comparison, write_report
+from lexsplat.evaluation.report import MeasuredMethod, write_comparison, write_report
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 VERSIONS = {f"package{number}": f"{number}.0.0+local.build" for number in range(12)}
@@ -25,7 +25,7 @@ def reports(tmp_path_factory):
         MeasuredMethod(name, [metrics.to_json()] * 2, curves, gallery=gallery)
         for name in ("averaged", "trained-feature", "dff", "lerf", "3dovs", "nearest")
     ]
-    write_comparison(folder / "comparison.html", Comparison(methods, "compare", machine=metrics.machine))
+    write_comparison(folder / "comparison.html", methods, "compare", config={}, machine=metrics.machine)
     return folder
 
 

@@ -17,7 +17,8 @@ from support.encoder_folders import normalized, save_model, seeded, unit
 from lexsplat.features import hub, pretrained
 from lexsplat.features.clip import check_patches
 from lexsplat.features.clip_image import ClipImages
-from lexsplat.features.encoders import ClipEncoder, load_clip, load_dino, resize_images
+from lexsplat.features.encoders import ClipEncoder, load_clip, load_dino
+from lexsplat.features.pretrained import resize_images
 from lexsplat.runtime.errors import ModelError
 
 PROMPTS = ["a red apple", "the wooden table", "stack of books next to a lamp"]

@@ -15,7 +15,7 @@ from lexsplat.captures import initial_points, load_capture
 from lexsplat.captures.images.bands import ArrayRows, FilledRows, whole
 from lexsplat.codebook import CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.features import FeatureConfig, FeatureMap, extract_features
-from lexsplat.features.masking import without_masked_cells
+from lexsplat.features.cache import without_masked_cells
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.language.code_maps import MASKED_CODE, MaskedCodeMaps, mark_masked_cells
 from lexsplat.language.methods import METHODS, FitRun, TrainingViews

@@ -9,7 +9,7 @@ The path of a photo, file by file:
 
 To add a reader of camera files: write ``readers/FORMAT.py`` with ``find_FORMAT(root) -> Path | None`` and
 ``read_FORMAT(path) -> CameraFiles`` (take names, lenses and poses through `checked_name`, `checked_lens` and
-`checked_pose`), call both in ``loading._read_camera_files`` and ``loading.is_photo_folder``, and add a valid file to
+`checked_pose`), call both in ``loading._read_camera_files`` and ``loading._has_cameras``, and add a valid file to
 ``tests/support/hostile``.
 To add a layout of ground truth, see ``ground_truth/layouts.py``.
 """

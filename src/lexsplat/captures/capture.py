@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lexsplat.captures.images.bands import FilledRows, MaskRows, Rows, resized
-from lexsplat.captures.images.reading import PhotoRows, image_size, read_mask, resize_nearest, sizes_agree
+from lexsplat.captures.images.reading import (
+    PhotoRows,
+    image_size,
+    misfit,
+    read_mask,
+    resize_nearest,
+    sizes_agree,
+)
 from lexsplat.captures.images.undistortion import Lens, RemappedRows, undistort, undistort_nearest
 from lexsplat.geometry.cameras import Camera, camera_extent
 from lexsplat.runtime.errors import CaptureError
@@ -161,12 +168,7 @@ class View:
     def _check_aspect(self, path: Path, found: tuple[int, int]) -> None:
         expected = (self.lens.width, self.lens.height)
         if not (sizes_agree(found, expected) or sizes_agree(found, self.capture_size)):
-            raise CaptureError(
-                path,
-                expected=f"a mask of {self.name}, {expected[0]}x{expected[1]} pixels or scaled uniformly",
-                found=f"{found[0]}x{found[1]}",
-                remedy="draw the mask on this photo, or remove it",
-            )
+            raise misfit(path, found, self.name, expected)
 
     def _checked_size(self, size: tuple[int, int] | None) -> tuple[int, int]:
         width, height = (self.camera.width, self.camera.height) if size is None else size
@@ -191,7 +193,6 @@ class Capture:
         points: Points of structure from motion ``[P, 3]``, world; P may be 0.
         point_colors: Their colors ``[P, 3]``, RGB in 0..1.
         warnings: What was skipped and why, one line each.
-        source: Format of the camera files: ``"colmap"`` or ``"transforms"``.
         background: Color behind transparent pixels, RGB in 0..1.
     """
 
@@ -202,7 +203,6 @@ class Capture:
     points: NDArray[np.float32] = field(default_factory=_no_points)
     point_colors: NDArray[np.float32] = field(default_factory=_no_points)
     warnings: tuple[str, ...] = ()
-    source: str = "colmap"
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property

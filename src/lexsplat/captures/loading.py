@@ -8,7 +8,7 @@ from pathlib import Path
 from shlex import quote
 
 from lexsplat.captures.capture import Capture, View, stem_of
-from lexsplat.captures.ground_truth.layouts import annotated_names, find_annotations
+from lexsplat.captures.ground_truth.layouts import annotated_names
 from lexsplat.captures.images.masks import IGNORE_FOLDER, find_ignore_masks
 from lexsplat.captures.images.reading import IMAGE_SUFFIXES, image_size, sizes_agree
 from lexsplat.captures.images.undistortion import pinhole_of
@@ -62,13 +62,12 @@ def load_capture(
     }
     _check_names([photo.name for photo in files.photos], files.origin)
     root = files.root if beside is None else Path(beside)
-    annotations = find_annotations(root)
     chosen, split_warnings = choose_test_names(
         list(views),
         root=root,
         test_names=test_names,
         listed=files.test_names,
-        annotated=annotated_names(*annotations, views, root / "images") if annotations else (),
+        annotated=annotated_names(root, views),
         test_every=test_every,
     )
     warnings += split_warnings
@@ -82,7 +81,6 @@ def load_capture(
         points=files.points,
         point_colors=files.point_colors,
         warnings=tuple(warnings),
-        source=files.source,
         background=files.background,
     )
 
@@ -109,22 +107,22 @@ def _check_names(names: list[str], origin: Path) -> None:
     """
     stems: dict[str, str] = {}
     for name in names:
-        twice = stem_of(name) in stems
-        other = stems.setdefault(stem_of(name), name)
-        if twice and other == name:
+        other = stems.get(stem_of(name))
+        if other == name:
             raise CaptureError(
                 origin,
                 expected="every image once",
                 found=f"{name} twice",
                 remedy="remove one of the two from the file",
             )
-        if other != name:
+        if other is not None:
             raise CaptureError(
                 origin,
                 expected="image names that differ in more than their suffix",
                 found=f"{other} and {name}",
                 remedy="rename or remove one of the two",
             )
+        stems[stem_of(name)] = name
 
 
 def _read_camera_files(path: Path, images: Path | None) -> CameraFiles:
@@ -161,9 +159,7 @@ def check_capture(path: Path) -> None:
     Raises:
         CaptureError: With what is there instead.
     """
-    if path.is_file() or is_photo_folder(path):
-        return
-    if not path.is_dir() or (find_model(path) is None and find_transforms(path) is None):
+    if not (path.is_file() or is_photo_folder(path) or _has_cameras(path)):
         _read_camera_files(path, None)
 
 
@@ -172,12 +168,11 @@ def is_photo_folder(path: Path) -> bool:
 
     A video counts as such a folder of frames.
     """
-    return is_video(path) or (
-        path.is_dir()
-        and find_model(path) is None
-        and find_transforms(path) is None
-        and bool(_photos_of(path))
-    )
+    return is_video(path) or (path.is_dir() and not _has_cameras(path) and bool(_photos_of(path)))
+
+
+def _has_cameras(path: Path) -> bool:
+    return find_model(path) is not None or find_transforms(path) is not None
 
 
 def _photos_of(path: Path) -> list[Path]:

@@ -1,6 +1,6 @@
 """Evaluation of a scene on held-out views: image quality, language, speed and size, as in the paper's Table 1."""
 
-from lexsplat.evaluation.ground_truth import GroundTruth, GroundTruthSource, Masks
+from lexsplat.evaluation.ground_truth import GroundTruthSource
 from lexsplat.evaluation.measuring import EvaluationConfig, evaluate
 from lexsplat.evaluation.memory import forget_peak_memory, peak_gpu_memory, peak_memory
 from lexsplat.evaluation.methods import Method, MethodScene
@@ -12,9 +12,7 @@ __all__ = [
     "PROTOCOLS",
     "THRESHOLD_KINDS",
     "EvaluationConfig",
-    "GroundTruth",
     "GroundTruthSource",
-    "Masks",
     "Method",
     "MethodScene",
     "Metrics",

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 from lexsplat.evaluation.ablate import language_row
-from lexsplat.evaluation.baselines import BASELINES, Baseline, BaselineRun, TrainingData
+from lexsplat.evaluation.baselines import BASELINES, BaselineRun, TrainingData
 from lexsplat.evaluation.experiments import Bench, Made, Row
 from lexsplat.language.methods import METHODS, MethodName
 from lexsplat.queries.relevancy import QueryForm, embed_prompts
@@ -64,14 +64,14 @@ def _row(bench: Bench, name: str) -> Row:
     baseline = BASELINES[name]
     prompts = bench.ground_truth.prompts() if baseline.knows_prompts else ()
     key = [name, baseline.settings, list(prompts)]
-    return Row(name, key, lambda seed: _fitted(bench, baseline, prompts, seed))
 
+    def make(seed: int) -> Made:
+        training = {view.name: view.camera for view in bench.capture.train_views}
+        data = TrainingData(bench.gaussians, training, bench.maps, bench.level_maps)
+        cameras = {name: view.camera for name, view in bench.capture.views.items()}
+        start = time.perf_counter()
+        classes = embed_prompts(prompts, bench.encode_text) if prompts else None
+        run = BaselineRun(cameras, classes, seed, bench.config.memory_bytes, bench.listener)
+        return baseline.fit(data, run), {name: time.perf_counter() - start}
 
-def _fitted(bench: Bench, baseline: Baseline, prompts: Sequence[str], seed: int) -> Made:
-    training = {view.name: view.camera for view in bench.capture.train_views}
-    data = TrainingData(bench.gaussians, training, bench.maps, bench.level_maps)
-    cameras = {name: view.camera for name, view in bench.capture.views.items()}
-    start = time.perf_counter()
-    classes = embed_prompts(prompts, bench.encode_text) if prompts else None
-    run = BaselineRun(cameras, classes, seed, bench.config.memory_bytes, bench.listener)
-    return baseline.fit(data, run), {baseline.name: time.perf_counter() - start}
+    return Row(name, key, make)

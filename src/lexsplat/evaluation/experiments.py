@@ -10,7 +10,7 @@ import json
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ from lexsplat.captures import check_ground_truth_options
 from lexsplat.codebook import Codebook, CodebookConfig, assign_code_maps, fit_codebook
 from lexsplat.evaluation import (
     EvaluationConfig,
-    GroundTruth,
     GroundTruthSource,
     Method,
     MethodScene,
@@ -34,16 +33,9 @@ from lexsplat.evaluation import (
     peak_memory,
 )
 from lexsplat.evaluation.ground_truth import read_held_out
-from lexsplat.evaluation.report import (
-    Comparison,
-    Gallery,
-    MeasuredMethod,
-    table_rows,
-    write_comparison,
-    write_rows,
-)
+from lexsplat.evaluation.report import Gallery, MeasuredMethod, table_rows, write_comparison, write_rows
 from lexsplat.evaluation.results import plain
-from lexsplat.features import FeatureMaps, TextCache, load_level_maps
+from lexsplat.features import TextCache, load_level_maps
 from lexsplat.language.code_maps import MaskedCodeMaps
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.methods import METHODS
@@ -95,15 +87,13 @@ class MeasuredRun:
 
     Args:
         result: The content of its ``metrics.json``.
-        kept: Whether it was measured by an earlier command.
         detail: "curves" and "cases" as `report.MeasuredMethod` has them.
         images: File of its images; None if none were kept.
     """
 
     result: dict[str, Any]
-    kept: bool
-    detail: dict[str, Any] = field(default_factory=dict)
-    images: Path | None = None
+    detail: dict[str, Any]
+    images: Path | None
 
 
 class Bench:
@@ -151,22 +141,15 @@ class Bench:
         self._encoders = Encoders(
             config.clip, config.dino, self.config.encoder_device, config.features.segments
         )
-        self._maps: FeatureMaps | None = None
+        # Features of every view, the held-out ones too, outside every measured time.
+        self.maps = feature_maps(
+            self.capture, self.config, self._encoders, self.folder.features_path, listener
+        )
         self._texts = TextCache(self.folder.root / "checkpoints" / "texts")
         self._last: tuple[str, LanguageField | Method, dict[str, float], Peaks] | None = None
         self._codebook_peaks: Peaks = {}
-        _ = self.maps  # of the held-out views too, outside every measured time
 
     # -- shared stages
-
-    @property
-    def maps(self) -> FeatureMaps:
-        """Features of every view, read from the cache."""
-        if self._maps is None:
-            self._maps = feature_maps(
-                self.capture, self.config, self._encoders, self.folder.features_path, self.listener
-            )
-        return self._maps
 
     def level_maps(self, name: str) -> tuple[Tensor, list[float]]:
         """The CLIP map of each crop size of a view, and the sides of the crops (`features.load_level_maps`)."""
@@ -177,7 +160,6 @@ class Bench:
                 found="one feature a pixel",
                 remedy="leave --features-from out, or the method (lerf) with --methods",
             )
-        _ = self.maps  # stores the features of all views
         return load_level_maps(
             self.capture, self._encoders.clip, self.config.features, self.folder.features_path, name
         )
@@ -233,7 +215,7 @@ class Bench:
     def measure(
         self, stem: str, rows: Sequence[Row], seeds: Sequence[int], columns: Sequence[str] = ()
     ) -> list[dict[str, Any]]:
-        """Measure every row with every seed, and write the files of `write_results` after each run.
+        """Measure every row with every seed; writes ``STEM.json``, ``.csv``, ``.tex`` and ``.html`` after each run.
 
         Seed by seed, so that an interrupted command leaves complete tables of fewer seeds.
 
@@ -252,8 +234,43 @@ class Bench:
             for row in rows:
                 run = self.run(row, seed, keep_images=seed == seeds[0])
                 runs.setdefault(row.name, []).append(run)
-                table = write_results(self, stem, runs, columns)
+                table = self._write(stem, runs, columns)
         return table
+
+    def _write(
+        self, stem: str, runs: Mapping[str, Sequence[MeasuredRun]], columns: Sequence[str]
+    ) -> list[dict[str, Any]]:
+        """Write the files of the runs so far; returns the rows of the table."""
+        rows = table_rows({name: [run.result for run in done] for name, done in runs.items()})
+        languages = {name: [run.result["language"] for run in done] for name, done in runs.items()}
+        config, machine = to_json(self.config), machine_facts()
+        facts = {
+            "seeds": sorted({run.result["config"]["seed"] for done in runs.values() for run in done}),
+            "evaluation": to_json(self.evaluation),
+            "ground_truth": self.ground_truth.origin_facts(self.origin.prompt_list),
+        }
+        content = {
+            "rows": rows,
+            "config": config,
+            **facts,
+            "machine": machine,
+            "forms": {name: done[0]["form"] for name, done in languages.items()},
+            "runs": {name: [language["strict"] for language in done] for name, done in languages.items()},
+            "per_prompt": {
+                name: [language["per_prompt"] for language in done] for name, done in languages.items()
+            },
+        }
+        write_rows(self.output, stem, rows, columns)
+        write_json(self.output / f"{stem}.json", content)
+        write_comparison(
+            self.output / f"{stem}.html",
+            [_with_images(name, done) for name, done in runs.items()],
+            f"lexsplat {'ablate' if stem == 'ablation' else 'compare'}: {self.capture.root.name}",
+            columns,
+            config={**config, **facts},
+            machine=machine,
+        )
+        return rows
 
     def run(self, row: Row, seed: int, *, keep_images: bool = False) -> MeasuredRun:
         """Make and measure a language, unless the same settings, code and ground truth were measured before.
@@ -273,7 +290,7 @@ class Bench:
                 stored = read_json(path)
                 if stored["fingerprint"] == inputs:
                     detail = stored.get("detail", {})
-                    return MeasuredRun(stored["metrics"], True, detail, images if images.is_file() else None)
+                    return MeasuredRun(stored["metrics"], detail, images if images.is_file() else None)
             except (FileFormatError, KeyError, TypeError) as error:
                 log.warning("%s is damaged and is measured again (%s)", path, error)
         language, seconds, peaks = self._made(
@@ -285,7 +302,7 @@ class Bench:
             self.capture,
             self._scene_of(language, query),
             self.evaluation,
-            ground_truth=GroundTruth(self.ground_truth.masks, self.ground_truth.boxes),
+            ground_truth=self.ground_truth,
             observer=gallery.add if keep_images else None,
             listener=self.listener,
         ).with_facts(
@@ -299,7 +316,7 @@ class Bench:
             write_tensors(images, gallery.tensors(), {"fingerprint": inputs})
         stored = {"fingerprint": inputs, "name": row.name, "seed": seed, "metrics": result, "detail": detail}
         write_json(path, stored)
-        return MeasuredRun(result, False, detail, images if keep_images else None)
+        return MeasuredRun(result, detail, images if keep_images else None)
 
     def _made(
         self, key: str, make: Callable[[], Made]
@@ -307,8 +324,7 @@ class Bench:
         """The language, its seconds and peaks; a language that is measured in two forms is made once."""
         if self._last is None or self._last[0] != key:
             self._last, self._codebook_peaks = None, {}  # frees the language made before
-            if self._maps is not None:
-                self._maps.forget()
+            self.maps.forget()
             forget_peak_memory()
             language, seconds = make()
             peaks = {
@@ -335,50 +351,6 @@ class Bench:
             for view, prompts in self.ground_truth.masks.items()
         }
         return [masks, self.ground_truth.boxes]
-
-
-def write_results(
-    bench: Bench, stem: str, runs: Mapping[str, Sequence[MeasuredRun]], columns: Sequence[str] = ()
-) -> list[dict[str, Any]]:
-    """Write ``STEM.json``, ``.csv``, ``.tex`` and ``.html`` of the runs so far; returns the rows of the table.
-
-    Args:
-        bench: The bench on which they were measured.
-        stem: "comparison" or "ablation".
-        runs: The runs of each row, in the order of the table.
-        columns: See `Bench.measure`.
-    """
-    folder = bench.output
-    rows = table_rows({name: [run.result for run in done] for name, done in runs.items()})
-    languages = {name: [run.result["language"] for run in done] for name, done in runs.items()}
-    config, machine = to_json(bench.config), machine_facts()
-    facts = {
-        "seeds": sorted({run.result["config"]["seed"] for done in runs.values() for run in done}),
-        "evaluation": to_json(bench.evaluation),
-        "ground_truth": bench.ground_truth.origin_facts(bench.origin.prompt_list),
-    }
-    content = {
-        "rows": rows,
-        "config": config,
-        **facts,
-        "machine": machine,
-        "forms": {name: done[0]["form"] for name, done in languages.items()},
-        "runs": {name: [language["strict"] for language in done] for name, done in languages.items()},
-        "per_prompt": {
-            name: [language["per_prompt"] for language in done] for name, done in languages.items()
-        },
-    }
-    write_rows(folder, stem, rows, columns)
-    write_json(folder / f"{stem}.json", content)
-    comparison = Comparison(
-        [_with_images(name, done) for name, done in runs.items()],
-        title=f"lexsplat {'ablate' if stem == 'ablation' else 'compare'}: {bench.capture.root.name}",
-        columns=columns,
-        config={**config, **facts},
-        machine=machine,
-    )
-    write_comparison(folder / f"{stem}.html", comparison)
-    return rows
 
 
 def _with_images(name: str, runs: Sequence[MeasuredRun]) -> MeasuredMethod:

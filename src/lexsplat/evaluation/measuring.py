@@ -20,10 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from lexsplat.captures.ground_truth.layouts import load_ground_truth
-from lexsplat.evaluation.ground_truth import GroundTruth
+from lexsplat.captures.ground_truth.layouts import Annotations, load_annotations, load_ground_truth
 from lexsplat.evaluation.memory import peak_gpu_memory, peak_memory
 from lexsplat.evaluation.methods import MethodScene
 from lexsplat.evaluation.metrics import (
@@ -82,7 +80,8 @@ def evaluate(
     scene: Scene | MethodScene,
     config: EvaluationConfig | None = None,
     *,
-    ground_truth: GroundTruth | None = None,
+    ground_truth: Annotations | None = None,
+    prompt_kinds: Mapping[str, str] | None = None,
     observer: Callable[[ViewImages], None] | None = None,
     listener: Listener = silent,
 ) -> Metrics:
@@ -92,35 +91,32 @@ def evaluate(
         capture: Photos, cameras and the split.
         scene: What is measured; the fixed threshold is that of its ``query``.
         config: Settings.
-        ground_truth: What the language is measured against; None takes masks and boxes of the capture
-            (`lexsplat.captures.load_annotations`).
+        ground_truth: What the language is measured against; None takes that of the capture
+            (`lexsplat.captures.load_annotations`). Masks of training views are ignored. Where there are no boxes for
+            LangSplat's localization, those of the masks stand in.
+        prompt_kinds: Kind of each prompt ("name", "color", "part", ...); adds the numbers of each kind.
         observer: Receives the images of each held-out view once, for reports.
         listener: Receives progress events.
 
     Returns:
         What was measured; `Metrics.with_facts` adds what is known of build and machine.
     """
-    config = config or EvaluationConfig()
-    if ground_truth is None:
-        from lexsplat.captures import load_annotations
-
-        found = load_annotations(capture)
-        ground_truth = GroundTruth(found.masks, found.boxes)
+    config, ground_truth = config or EvaluationConfig(), ground_truth or load_annotations(capture)
     listener(Event("evaluate", 0, len(capture.test_names)))
     run = _Evaluation(capture, scene, config, ground_truth)
     quality = run.run(observer, listener)
     words = summarize_language(run.pairs, run.thresholds)
     if words is not None:
         words = {"form": scene.query.form, "method": scene.field.method, **words}
-        words["per_kind"] = summarize_kinds(run.pairs, run.thresholds, ground_truth.prompt_kinds)
+        words["per_kind"] = summarize_kinds(run.pairs, run.thresholds, prompt_kinds or {})
     return Metrics(
         quality=quality,
         language=words,
         speed={**run.speed(), "stage_seconds": {}},
         size={
             "gaussians": len(scene.gaussians),
-            "language_bytes": _bytes(scene.field.tensors()),
-            "gaussian_bytes": _bytes(scene.gaussians.tensors()),
+            "language_bytes": sum(tensor.nbytes for tensor in scene.field.tensors().values()),
+            "gaussian_bytes": sum(tensor.nbytes for tensor in scene.gaussians.tensors().values()),
             "peak_rss_bytes": peak_memory(),
             "peak_gpu_bytes": peak_gpu_memory(scene.gaussians.device),
         },
@@ -139,7 +135,7 @@ class _Evaluation:
         capture: Capture,
         scene: Scene | MethodScene,
         config: EvaluationConfig,
-        ground_truth: GroundTruth,
+        ground_truth: Annotations,
     ) -> None:
         self.capture, self.scene, self.config = capture, scene, config
         masks, self.boxes = ground_truth.masks, ground_truth.boxes
@@ -221,34 +217,21 @@ class _Evaluation:
         }
 
         def measured(prompt: str) -> PairResult:
-            maps = relevancy[prompt], working[prompt], ground_truth[prompt]
-            return self._pair(view, prompt, *maps, silhouettes.get(prompt))
+            found, mask, thresholds = relevancy[prompt], ground_truth[prompt], self.thresholds[prompt]
+            boxes, asked = self.boxes.get(view.name, {}).get(prompt), self.config.protocols
+            return PairResult(
+                threshold_counts(found, mask),
+                mask_scores(found >= thresholds["auto"], mask),
+                average_precision(found, mask),
+                localization(found, mask),
+                official_scores(working[prompt], mask, thresholds["fixed"]) if "official" in asked else None,
+                lerf_2d_scores(found, mask, boxes) if "lerf-2d" in asked and mask.any() else None,
+                silhouettes.get(prompt),
+            )
 
         with ThreadPoolExecutor(kernel_threads()) as pool:  # counting and sorting release the GIL
             self.pairs[view.name] = dict(zip(ground_truth, pool.map(measured, ground_truth)))
         return relevancy, ground_truth
-
-    def _pair(
-        self,
-        view: View,
-        prompt: str,
-        relevancy: NDArray[np.float32],
-        working: NDArray[np.float32],
-        mask: NDArray[np.bool_],
-        silhouette: float | None,
-    ) -> PairResult:
-        """One prompt in one view: ``relevancy`` at the size of the ground truth, ``working`` at the working size."""
-        asked, thresholds = self.config.protocols, self.thresholds[prompt]
-        boxes = self.boxes.get(view.name, {}).get(prompt)
-        return PairResult(
-            threshold_counts(relevancy, mask),
-            mask_scores(relevancy >= thresholds["auto"], mask),
-            average_precision(relevancy, mask),
-            localization(relevancy, mask),
-            official_scores(working, mask, thresholds["fixed"]) if "official" in asked else None,
-            lerf_2d_scores(relevancy, mask, boxes) if "lerf-2d" in asked and mask.any() else None,
-            silhouette,
-        )
 
     @torch.no_grad()
     def _silhouette(self, camera: Camera, prompt: str, mask: NDArray[np.bool_]) -> float:
@@ -291,7 +274,3 @@ class _Evaluation:
         for camera in cameras:
             work(camera)
         return max(time.perf_counter() - start, 1e-9) / len(cameras)
-
-
-def _bytes(tensors: Mapping[str, Tensor]) -> int:
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import re
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -19,12 +20,10 @@ def peak_memory() -> int | None:
 
     None if the system does not report it.
     """
-    try:
+    with suppress(OSError):
         found = re.search(r"^VmHWM:\s*(\d+) kB", _STATUS.read_text(), flags=re.MULTILINE)
         if found:
             return 1024 * int(found[1])
-    except OSError:
-        pass
     try:
         import resource
     except ImportError:  # Windows

@@ -22,15 +22,12 @@ class Method(Protocol):
 
     def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
         """Maps ``[P, H, W]`` of the prompts in a view, in 0..1."""
-        ...
 
     def gaussian_scores(self, question: Question) -> Tensor | None:
         """Scores ``[P, N]`` of the Gaussians in 0..1; None for a method without 3D."""
-        ...
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensors that have to be stored to answer prompts."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -114,9 +114,8 @@ def average_precision(scores: ArrayLike, ground_truth: ArrayLike) -> float:
         return math.nan
     hits = np.sort(values[mask])
     ranked = np.sort(values[values >= hits[0]])  # no threshold predicts the others
-    found = np.arange(
-        len(hits), 0, -1
-    )  # from the lowest threshold to the highest; of ties the first one counts
+    # From the lowest threshold to the highest; of ties the first one counts.
+    found = np.arange(len(hits), 0, -1)
     predicted = len(ranked) - np.searchsorted(ranked, hits, side="left")
     precisions, recalls = (found / predicted)[::-1], (found / len(hits))[::-1]
     return float(interpolated_precision(precisions, recalls).mean())

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from lexsplat.captures.ground_truth.layouts import load_annotations
 from lexsplat.captures.ground_truth.prompt_lists import PromptList
-from lexsplat.evaluation.ground_truth import GroundTruth, GroundTruthSource, read_held_out
+from lexsplat.evaluation.ground_truth import GroundTruthSource, read_held_out
 from lexsplat.evaluation.measuring import EvaluationConfig, evaluate
 from lexsplat.evaluation.protocols import PROTOCOLS
 from lexsplat.evaluation.report.gallery import Gallery
@@ -69,9 +69,10 @@ def evaluate_scene(
     require_writable(folder.root)
     photos = reload_capture(folder, capture)
     if not photos.test_names:
-        log.warning(
-            "%s: no held-out views: neither images nor language are measured; %s", folder.root, _way(record)
-        )
+        way = "build it with --test-every or --test-views"
+        if is_of_chosen_views(record):
+            way = "views of splats are no ground truth, so give lexsplat language the photos, too"
+        log.warning("%s: no held-out views: neither images nor language are measured; %s", folder.root, way)
     source = GroundTruthSource(masks, prompt_list)
     found = load_annotations(photos) if source == GroundTruthSource() else read_held_out(photos, source)
     gallery = Gallery()
@@ -79,7 +80,8 @@ def evaluate_scene(
         photos,
         scene,
         EvaluationConfig(protocols=tuple(protocols)),
-        ground_truth=GroundTruth(found.masks, found.boxes, _prompt_kinds(photos.root)),
+        ground_truth=found,
+        prompt_kinds=_prompt_kinds(photos.root),
         observer=gallery.add,
         listener=listener,
     ).with_facts(
@@ -109,13 +111,6 @@ def evaluate_scene(
             temporary.write_bytes(images["heatmap"])
     listener(Event("report", len(gallery.views), len(gallery.views)))
     return result
-
-
-def _way(record: Mapping[str, Any]) -> str:
-    """How a scene gets held-out views."""
-    if is_of_chosen_views(record):
-        return "views of splats are no ground truth, so give lexsplat language the photos, too"
-    return "build it with --test-every or --test-views"
 
 
 def _prompt_kinds(root: Path) -> dict[str, str]:

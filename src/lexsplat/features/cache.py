@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -25,6 +25,9 @@ from lexsplat.features.pyramid import CropLevel, dense_map, mean_map
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import digest
+
+if TYPE_CHECKING:
+    from lexsplat.captures import Capture
 
 FORMAT_VERSION = "1"
 
@@ -56,7 +59,7 @@ class FeatureMap:
     @property
     def nbytes(self) -> int:
         """Bytes held in memory."""
-        own = sum(part.numel() * part.element_size() for part in (self.clip, self.dino) if part is not None)
+        own = sum(part.nbytes for part in (self.clip, self.dino) if part is not None)
         return own + sum(level.nbytes for level in self.levels)
 
 
@@ -123,6 +126,30 @@ class FeatureMaps(Mapping[str, FeatureMap]):
     def cached_bytes(self) -> int:
         """Bytes of the maps currently in memory."""
         return sum(found.nbytes for found in self._kept.values())
+
+
+def without_masked_cells(maps: FeatureMaps, capture: Capture) -> FeatureMaps:
+    """Feature maps in which cells without an unmasked pixel are zero; the codebook skips zero cells.
+
+    Encoders see masked pixels in the photo's mean color (`lexsplat.captures.View.load_image`).
+
+    Args:
+        maps: Maps by view name.
+        capture: The views.
+    """
+    if all(capture.views[name].ignore_path is None for name in maps if name in capture.views):
+        return maps
+
+    def load(name: str) -> FeatureMap:
+        found = maps[name]
+        height, width = found.clip.shape[:2]
+        share = capture.views[name].valid_share((width, height))
+        if share is None:
+            return found
+        counts = torch.from_numpy(share > 0)[..., None].to(found.clip.device)
+        return FeatureMap(found.clip * counts, None if found.dino is None else found.dino * counts)
+
+    return FeatureMaps(list(maps), load, 0, source=maps)
 
 
 def hash_of(*parts: Any) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import logging
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,13 +14,18 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lexsplat.features.clip_image import ClipImages
-from lexsplat.features.clip_text import UNLIKE, UNLIKE_WORDS, ClipText, light_tower
+from lexsplat.features.clip_text import (
+    UNLIKE,
+    UNLIKE_WORDS,
+    ClipText,
+    is_vocabulary,
+    light_tower,
+    warn_truncated,
+)
 from lexsplat.features.hub import local_folder
 from lexsplat.features.portable import TextWeights, tokenizer_content
 from lexsplat.features.pretrained import PretrainedModel, check_images, normalization, resize_images
 from lexsplat.runtime.errors import ModelError
-
-log = logging.getLogger("lexsplat")
 
 DEFAULT_CLIP = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 """The CLIP of the paper's released code."""
@@ -31,7 +35,8 @@ _HALF = (0.5, 0.5, 0.5)
 _TEXT_BATCH = 64
 _ACTIVATIONS = ("quick_gelu", "gelu", "gelu_pytorch_tanh")
 """Of text towers that other programs can compute."""
-_PADDING = 128  # vocabularies are padded to a multiple of at most this
+_WITH_PATCHES = "a model of CLIP's architecture for patch-level embeddings"
+_WITHOUT_PATCHES = "use image-level embeddings only: `--features.crop-tokens class`"
 
 
 class ClipEncoder(PretrainedModel):
@@ -98,10 +103,7 @@ class ClipEncoder(PretrainedModel):
         """
         check_images(images)
         if (tower := self._images) is None:
-            raise self._refusal(
-                "a model of CLIP's architecture for patch-level embeddings",
-                "use image-level embeddings only: `--features.crop-tokens class`",
-            )
+            raise self._refusal(_WITH_PATCHES, _WITHOUT_PATCHES)
         pixels = self._pixels(images)
         found = F.normalize(
             self._finite(lambda: tower(pixels, patches=True), crops=True).float(), dim=-1
@@ -165,7 +167,8 @@ class ClipEncoder(PretrainedModel):
         if self._siglip:  # trained on lower case with padding to full length, without an attention mask
             prompts = [prompt.lower() for prompt in prompts]
         for prompt in prompts:
-            self._warn_if_truncated(prompt)
+            if over := self.tokens_over(prompt):
+                warn_truncated(prompt, self._text_length + over, self._text_length)
         tokens = self._tokenizer(
             prompts,
             padding="max_length" if self._siglip else True,
@@ -176,17 +179,9 @@ class ClipEncoder(PretrainedModel):
         keys = ("input_ids",) if self._siglip else ("input_ids", "attention_mask")
         return {key: tokens[key].to(self.device) for key in keys}
 
-    def _warn_if_truncated(self, prompt: str) -> None:
-        """Warn about a truncated prompt; a token has at least one character, except for the start and end tokens."""
-        if over := self.tokens_over(prompt):
-            subject, limit = prompt[:30] + "...", self._text_length
-            log.warning(
-                "%r: prompt truncated: %d tokens, the model's limit is %d", subject, limit + over, limit
-            )
-
     def tokens_over(self, prompt: str) -> int:
         """How many tokens of a prompt are more than the model reads, and so cut."""
-        if len(prompt) + 2 <= self._text_length:
+        if len(prompt) + 2 <= self._text_length:  # a token but start and end has at least one character
             return 0
         return max(len(self._tokenizer(prompt, verbose=False)["input_ids"]) - self._text_length, 0)
 
@@ -211,11 +206,7 @@ class ClipEncoder(PretrainedModel):
 
 
 def _load_tokenizer(folder: Path, name: str, config: Any) -> Any:
-    """The tokenizer of a model.
-
-    Raises:
-        ModelError: If it cannot be loaded, or its vocabulary is not the model's.
-    """
+    """The tokenizer of a model."""
     from transformers import AutoTokenizer
 
     refusal = functools.partial(ModelError, f"model {name}")
@@ -225,13 +216,11 @@ def _load_tokenizer(folder: Path, name: str, config: Any) -> Any:
     except Exception as error:  # tokenizers raise a different type for each missing file
         found, remedy = str(error)[:120], "fetch it again"
         if list(folder.glob("*.model")) and not all(map(_is_installed, ("sentencepiece", "google.protobuf"))):
-            found, remedy = (
-                "one of SentencePiece, which is not installed",
-                'run: pip install "lexsplat[siglip]"',
-            )
+            found = "one of SentencePiece, which is not installed"
+            remedy = 'run: pip install "lexsplat[siglip]"'
         raise refusal(expected="a tokenizer beside the weights", found=found, remedy=remedy) from error
     tokenizer.padding_side = "right"  # as in training; transformers' default for SigLIP 2 is "left"
-    if not size - _PADDING < len(tokenizer) <= size:
+    if not is_vocabulary(len(tokenizer), size):
         raise refusal(
             expected=f"a tokenizer with the {size:,} words of the model",
             found=f"{len(tokenizer):,} words",
@@ -258,12 +247,7 @@ def check_patches(folder: Path, name: str) -> None:
     except (OSError, ValueError, AttributeError):
         return  # loading the model reports the error
     if kind != "clip":
-        raise ModelError(
-            f"model {name}",
-            expected="a model of CLIP's architecture for patch-level embeddings",
-            found=str(kind),
-            remedy="use image-level embeddings only: `--features.crop-tokens class`",
-        )
+        raise ModelError(f"model {name}", expected=_WITH_PATCHES, found=str(kind), remedy=_WITHOUT_PATCHES)
 
 
 def patch_grid(name: str) -> int:

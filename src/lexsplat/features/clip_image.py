@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -18,18 +19,12 @@ from torch import Tensor
 _QUICK = 1.702
 """The activation "quick_gelu" of x is silu(1.702 x) / 1.702; both factors go into the weights around it."""
 _FEW_TOKENS = 65  # up to so many, plain attention is faster on a CPU than the fused kernel
-Activation = Callable[[Tensor], Tensor]
+Function = Callable[[Tensor], Tensor]
 
 
-@dataclass(frozen=True)
-class _Linear:
+def _linear(weight: Tensor, bias: Tensor) -> Function:
     """A linear layer: weight ``[out, in]``, bias ``[out]``."""
-
-    weight: Tensor
-    bias: Tensor
-
-    def __call__(self, x: Tensor) -> Tensor:
-        return F.linear(x, self.weight, self.bias)
+    return partial(F.linear, weight=weight, bias=bias)
 
 
 @dataclass(frozen=True)
@@ -37,12 +32,12 @@ class _Layer:
     """A transformer layer; queries are scaled, and keys and values are one matrix."""
 
     norm1: torch.nn.LayerNorm
-    query: _Linear
-    key_value: _Linear
-    out: _Linear
+    query: Function
+    key_value: Function
+    out: Function
     norm2: torch.nn.LayerNorm
-    grow: _Linear
-    shrink: _Linear
+    grow: Function
+    shrink: Function
 
     @classmethod
     def of(cls, layer: Any, heads: int, quick: bool) -> _Layer:
@@ -51,15 +46,15 @@ class _Layer:
         factor = _QUICK if quick else 1.0
         return cls(
             norm1=layer.layer_norm1,
-            query=_Linear(attention.q_proj.weight * scale, attention.q_proj.bias * scale),
-            key_value=_Linear(
+            query=_linear(attention.q_proj.weight * scale, attention.q_proj.bias * scale),
+            key_value=_linear(
                 torch.cat([attention.k_proj.weight, attention.v_proj.weight]),
                 torch.cat([attention.k_proj.bias, attention.v_proj.bias]),
             ),
-            out=_Linear(attention.out_proj.weight, attention.out_proj.bias),
+            out=_linear(attention.out_proj.weight, attention.out_proj.bias),
             norm2=layer.layer_norm2,
-            grow=_Linear(mlp.fc1.weight * factor, mlp.fc1.bias * factor),
-            shrink=_Linear(mlp.fc2.weight / factor, mlp.fc2.bias),
+            grow=_linear(mlp.fc1.weight * factor, mlp.fc1.bias * factor),
+            shrink=_linear(mlp.fc2.weight / factor, mlp.fc2.bias),
         )
 
 
@@ -79,8 +74,8 @@ class ClipImages:
         self.patches = int(config.image_size) // self._patch
         """Patches along a side of an image."""
         quick = config.hidden_act == "quick_gelu"
-        own: Activation = tower.encoder.layers[-1].mlp.activation_fn
-        self._activation: Activation = (lambda x: F.silu(x, inplace=True)) if quick else own
+        own: Function = tower.encoder.layers[-1].mlp.activation_fn
+        self._activation: Function = (lambda x: F.silu(x, inplace=True)) if quick else own
         embeddings = tower.embeddings
         self._embed = embeddings.patch_embedding.weight.flatten(1)
         self._position = embeddings.position_embedding.weight.clone()

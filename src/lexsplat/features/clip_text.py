@@ -33,7 +33,6 @@ _DEFAULTS = {  # of transformers' CLIPTextConfig, which files may leave out
 _LEGACY_END = 2
 """An end token of this number stands for the largest number in the prompt, as in OpenAI's code."""
 _MOST_LAYERS = 1000
-_PADDING = 128  # vocabularies are padded to a multiple of at most this
 UNLIKE = 1e-5
 """Distance of two unit vectors that are equal but for rounding."""
 UNLIKE_WORDS = ("an apple", "a wooden table", "blue sky", "a car")
@@ -109,7 +108,18 @@ def _tokenizer(path: Path, size: int) -> Any:
         return None
     tokenizer.no_truncation()
     tokenizer.no_padding()
-    return tokenizer if size - _PADDING < tokenizer.get_vocab_size() <= size else None
+    return tokenizer if is_vocabulary(tokenizer.get_vocab_size(), size) else None
+
+
+def is_vocabulary(words: int, size: int) -> bool:
+    """Whether a tokenizer of so many words belongs to a model of ``size``, padded to a multiple of at most 128."""
+    return size - 128 < words <= size
+
+
+def warn_truncated(prompt: str, tokens: int, limit: int) -> None:
+    """Warn of a prompt with more tokens than the model reads."""
+    subject = prompt[:30] + "..."
+    log.warning("%r: prompt truncated: %d tokens, the model's limit is %d", subject, tokens, limit)
 
 
 def _shapes(settings: Mapping[str, Any], projection: int) -> dict[str, tuple[int, ...]]:
@@ -153,10 +163,8 @@ class ClipText:
         self.device = torch.device(device)
         self._heads, self._layers = settings["num_attention_heads"], settings["num_hidden_layers"]
         self._epsilon, self._end = settings["layer_norm_eps"], settings["eos_token_id"]
-        self._limit, self._activation = (
-            settings["max_position_embeddings"],
-            _ACTIVATIONS[settings["hidden_act"]],
-        )
+        self._limit = settings["max_position_embeddings"]
+        self._activation = _ACTIVATIONS[settings["hidden_act"]]
         # Copies, because tensors in a file are not aligned, and alignment affects the rounding of sums.
         self._weights = {
             re.sub(r"^text_model\.", "", name): value.to(self.device, torch.float32, copy=True)
@@ -191,11 +199,8 @@ class ClipText:
         """Numbers of the tokens ``[T]``, with start and end, at most as many as the model has positions."""
         tokens = self._tokenizer.encode(prompt).ids
         if len(tokens) > self._limit:
-            subject, limit = prompt[:30] + "...", self._limit
-            log.warning(
-                "%r: prompt truncated: %d tokens, the model's limit is %d", subject, len(tokens), limit
-            )
-            tokens = [*tokens[: limit - 1], tokens[-1]]
+            warn_truncated(prompt, len(tokens), self._limit)
+            tokens = [*tokens[: self._limit - 1], tokens[-1]]
         return torch.tensor(tokens, device=self.device)
 
     def _attention(self, x: Tensor, name: str) -> Tensor:

@@ -12,14 +12,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.features.pretrained import PretrainedModel, check_images, normalization, resize_images
+from lexsplat.features.pretrained import IMAGENET, PretrainedModel, check_images, normalization, resize_images
 
 DEFAULT_DINO = "facebook/dino-vits8"
 """The DINO of the paper's released code."""
 
 Facet = Literal["key", "token"]
-
-_IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class DinoEncoder(PretrainedModel):
@@ -40,15 +38,13 @@ class DinoEncoder(PretrainedModel):
         self.patch_size = int(config.patch_size)
         self.dim = int(config.hidden_size)
         self.num_layers = len(self._keys)
-        self._mean, self._std = normalization(folder, (_IMAGENET_MEAN, _IMAGENET_STD), self.device)
+        self._mean, self._std = normalization(folder, IMAGENET, self.device)
         self._caught = threading.local()  # each thread that evaluates the model captures its own keys
         for projection in self._keys:
             projection.register_forward_hook(self._catch)
-        self._options: dict[str, Any] = {}
-        if "interpolate_pos_encoding" in inspect.signature(self._model.forward).parameters:
-            self._options["interpolate_pos_encoding"] = (
-                True  # the others interpolate always, or use rotary positions
-            )
+        # Models that do not take this option interpolate always, or use rotary positions.
+        taken = inspect.signature(self._model.forward).parameters
+        self._options = {name: True for name in ("interpolate_pos_encoding",) if name in taken}
 
     @torch.inference_mode()
     def encode_dense(

@@ -15,20 +15,6 @@ from torch import Tensor
 from lexsplat.features.clip import DEFAULT_CLIP, ClipEncoder
 from lexsplat.features.dino import DEFAULT_DINO, DinoEncoder, Facet
 from lexsplat.features.hub import model_folder
-from lexsplat.features.pretrained import resize_images
-
-__all__ = [
-    "DEFAULT_CLIP",
-    "DEFAULT_DINO",
-    "ClipEncoder",
-    "DenseEncoder",
-    "DinoEncoder",
-    "Facet",
-    "ImageTextEncoder",
-    "load_clip",
-    "load_dino",
-    "resize_images",
-]
 
 
 class ImageTextEncoder(Protocol):
@@ -43,19 +29,15 @@ class ImageTextEncoder(Protocol):
     @property
     def patches(self) -> int:
         """Patches along a side in `encode_patches`; 0 if the encoder has none."""
-        ...
 
     def encode_images(self, images: Tensor) -> Tensor:
         """``[B, 3, h, w]`` in 0..1 to ``[B, D]``, float32 on the CPU, unit length."""
-        ...
 
     def encode_patches(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """The same ``[B, D]``, and embeddings of the patches ``[B, P, P, D]``; see `ClipEncoder`."""
-        ...
 
     def encode_text(self, prompts: Sequence[str]) -> Tensor:
         """Prompts to ``[B, D]``, float32 on the CPU, unit length."""
-        ...
 
 
 class DenseEncoder(Protocol):
@@ -77,7 +59,6 @@ class DenseEncoder(Protocol):
         max_tokens: int = 4096,
     ) -> Tensor:
         """``[3, h, w]`` in 0..1 to ``[h', w', D]``, float32 on the CPU, unit length; see `DinoEncoder`."""
-        ...
 
 
 def load_clip(name: str = DEFAULT_CLIP, device: torch.device | str = "cpu") -> ClipEncoder:

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from lexsplat.features.checks import bundled_images
 from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
-from lexsplat.features.extraction import cpu_batch, encoded_size, parallel_views
+from lexsplat.features.extraction import cpu_batch, crop_levels, encoded_size, parallel_views
 from lexsplat.features.pretrained import resize_images
-from lexsplat.features.pyramid import cut_crops, encode_stream, grid_levels, random_levels, unique_boxes
+from lexsplat.features.pyramid import cut_crops, encode_stream, unique_boxes
 from lexsplat.features.settings import FeatureConfig
+from lexsplat.runtime.device import torch_threads
 from lexsplat.runtime.progress import duration
 
 _SHORT = 0.5  # seconds below which a measurement is repeated with more crops
@@ -54,14 +55,11 @@ def estimate(
         config: Settings of the features.
         capture_size: Width and height of a photo.
     """
-    threads, photos = torch.get_num_threads(), parallel_views(clip.device)
-    torch.set_num_threads(max(1, threads // photos))
-    try:
+    photos = parallel_views(clip.device)
+    with torch_threads(max(1, torch.get_num_threads() // photos)):
         seconds = _crop_seconds(clip, config, capture_size) * count_crops(config, capture_size)
         if dino is not None:
             seconds += _dense_seconds(dino, config, capture_size)
-    finally:
-        torch.set_num_threads(threads)
     return Estimate(count_crops(config, capture_size), seconds / photos)
 
 
@@ -87,11 +85,7 @@ def _crop_seconds(clip: ImageTextEncoder, config: FeatureConfig, capture_size: t
 
 def _boxes(config: FeatureConfig, capture_size: tuple[int, int]) -> NDArray[np.int32]:
     """The crops of a photo of this width and height ``[n, 3]``."""
-    size = encoded_size(capture_size, config)
-    if config.mode == "grid":
-        return unique_boxes(grid_levels(*size, config.crop_sizes, config.crop_strides))[0]
-    sides = np.linspace(*config.random_sizes, config.random_levels).tolist()
-    return unique_boxes(random_levels(*size, sides, config.random_crops, np.random.default_rng(0)))[0]
+    return unique_boxes(crop_levels(encoded_size(capture_size, config), config, seed=0))[0]
 
 
 def count_crops(config: FeatureConfig, capture_size: tuple[int, int]) -> int:

@@ -68,22 +68,15 @@ def load_external_features(
         found = reading.segments(path) if path.name.endswith("_f.npy") else reading.arrays(path)
         dims = {"clip": found.clip.shape[-1]} | ({} if found.dino is None else {"dino": found.dino.shape[-1]})
         if dimension is not None and dims["clip"] != dimension:
-            raise FileFormatError(
-                path,
-                expected=f"features of depth {dimension}, like the embeddings of the text encoder",
-                found=str(dims["clip"]),
-                remedy="give the encoder of the features with --clip",
-            )
+            expected = f"features of depth {dimension}, like the embeddings of the text encoder"
+            raise wrong(path, expected, dims["clip"], "give the encoder of the features with --clip")
         if depth and dims != depth:
-            raise _wrong(path, f"features of depth {depth}", dims, "give features of one encoder")
+            raise wrong(path, f"features of depth {depth}", dims, "give features of one encoder")
         depth.update(dims)
         if not allow_holes and not bool(found.clip.any(-1).all()):
-            raise FileFormatError(
-                path,
-                expected="a feature for every pixel, because the codebook has 256 codes",
-                found="pixels without a feature",
-                remedy="give --codebook.num-codes 255 or less",
-            )
+            expected = "a feature for every pixel, because the codebook has 256 codes"
+            remedy = "give --codebook.num-codes 255 or less"
+            raise wrong(path, expected, "pixels without a feature", remedy)
         return found
 
     return FeatureMaps(list(sources), load, memory // 4)
@@ -115,7 +108,7 @@ def external_sources(folder: Path, capture: Capture) -> dict[str, Path]:
         FileFormatError: If there is no folder, a view has no file, or one of a pair is missing.
     """
     if not folder.is_dir():
-        raise _wrong(folder, "a folder with one array per view", "no folder", "check the path")
+        raise wrong(folder, "a folder with one array per view", "no folder", "check the path")
     return {name: _source(folder, view.stem) for name, view in capture.views.items()}
 
 
@@ -140,17 +133,14 @@ def _source(folder: Path, stem: str) -> Path:
         if path.is_file():
             if path.name.endswith("_f.npy") and not _segments_of(path).is_file():
                 remedy = "put the segments of every pixel beside their features"
-                raise _wrong(_segments_of(path), f"the segments of {path.name}", "no such file", remedy)
+                raise wrong(_segments_of(path), f"the segments of {path.name}", "no such file", remedy)
             return path
     for ending in PICKLES:
         if (folder / f"{stem}{ending}").exists():
             refuse_pickle(folder / f"{stem}{ending}")
-    raise FileFormatError(
-        folder,
-        expected=f"{stem}.npy, {stem}.safetensors or {stem}_f.npy with {stem}_s.npy",
-        found="none of them",
-        remedy="give one array per view, named after the image without its suffix",
-    )
+    remedy = "give one array per view, named after the image without its suffix"
+    expected = f"{stem}.npy, {stem}.safetensors or {stem}_f.npy with {stem}_s.npy"
+    raise wrong(folder, expected, "none of them", remedy)
 
 
 class _Reading:
@@ -178,16 +168,16 @@ class _Reading:
                 parts = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
                 for name, part in parts.items():
                     if part.get_dtype() not in _FLOATS:
-                        raise _wrong(path, f"{name} as floating-point numbers", part.get_dtype())
+                        raise wrong(path, f"{name} as floating-point numbers", part.get_dtype())
                 dino = parts.pop("dino", None)
                 if len(parts) != 1 and "clip" not in parts:
-                    raise _wrong(path, 'a tensor "clip"', ", ".join(sorted(parts)) or "none")
+                    raise wrong(path, 'a tensor "clip"', ", ".join(sorted(parts)) or "none")
                 clip = parts.get("clip", next(iter(parts.values())))
                 if dino is not None and dino.get_shape()[:2] != clip.get_shape()[:2]:
-                    raise _wrong(path, f"dino of size {clip.get_shape()[:2]}", dino.get_shape()[:2])
+                    raise wrong(path, f"dino of size {clip.get_shape()[:2]}", dino.get_shape()[:2])
                 made = [None if part is None else self._sliced(part, path) for part in (clip, dino)]
         except (OSError, SafetensorError, ValueError, RuntimeError, OverflowError) as error:
-            raise _wrong(path, "safetensors", error) from error
+            raise wrong(path, "safetensors", error) from error
         return FeatureMap(*made)  # type: ignore[arg-type]
 
     def _sliced(self, part: Any, path: Path) -> torch.Tensor:
@@ -210,33 +200,25 @@ class _Reading:
         return FeatureMap(_unit(total, path))
 
     def open_segments(self, path: Path) -> tuple[NDArray, NDArray]:
-        """Features of segments ``[n, D]``, and the segments of the pixels ``[h, w]`` or ``[L, h, w]``, mapped.
-
-        Raises:
-            FileFormatError: If one has another shape, or the pixels not the photo's aspect.
-        """
+        """Features of segments ``[n, D]``, and the segments of the pixels ``[h, w]`` or ``[L, h, w]``, mapped."""
         features, pixels = open_npy(path), _segments_of(path)
         if features.ndim != 2 or 0 in features.shape:
-            raise _wrong(path, "features of segments [n, D]", list(features.shape))
+            raise wrong(path, "features of segments [n, D]", list(features.shape))
         numbers = open_npy(pixels)
         if numbers.ndim not in (2, 3) or 0 in numbers.shape:
-            raise _wrong(pixels, "segment ids [h, w] or [levels, h, w]", list(numbers.shape))
+            raise wrong(pixels, "segment ids [h, w] or [levels, h, w]", list(numbers.shape))
         self.check_aspect((*numbers.shape[-2:], features.shape[1]), pixels)
         return features, numbers
 
     def check_aspect(self, shape: tuple[int, ...], path: Path) -> None:
-        """Refuse an array ``[h, w, D]`` of another shape, or without the photo's aspect.
-
-        Raises:
-            FileFormatError: If it is one.
-        """
+        """Refuse an array ``[h, w, D]`` of another shape, or without the photo's aspect."""
         if len(shape) != 3 or 0 in shape:
-            raise _wrong(path, "features [h, w, D]", list(shape))
+            raise wrong(path, "features [h, w, D]", list(shape))
         height, width, _ = shape
         photo_width, photo_height = self.view.capture_size
         # Numbers of cells are rounded: either side may be off by one.
         if abs(height * photo_width - width * photo_height) >= photo_width + photo_height:
-            raise _wrong(
+            raise wrong(
                 path,
                 f"an array of the photo's aspect, {photo_width}x{photo_height}",
                 f"{width}x{height}",
@@ -246,12 +228,7 @@ class _Reading:
     def _cells(
         self, shape: tuple[int, ...], itemsize: int, path: Path
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows and columns to read of an array ``[h, w, D]``.
-
-        Raises:
-            FileFormatError: As `check_aspect`.
-            MemoryBudgetError: If the map does not fit.
-        """
+        """Rows and columns to read of an array ``[h, w, D]``."""
         self.check_aspect(shape, path)
         height, width, depth = shape
         rows, columns = min(height, self.view.camera.height), min(width, self.view.camera.width)
@@ -274,10 +251,10 @@ def segment_numbers(segments: NDArray, path: Path, count: int = 1 << 31) -> NDAr
         FileFormatError: If they are others.
     """
     if not np.isfinite(segments).all() or np.abs(segments.astype(np.float64)).max() > 2**31:
-        raise _wrong(path, "integer segment ids", "NaN, infinity or values beyond 2^31")
+        raise wrong(path, "integer segment ids", "NaN, infinity or values beyond 2^31")
     index = segments.astype(np.int64)
     if index.min() < -1 or index.max() >= count or (index != segments).any():
-        raise _wrong(path, f"integers from -1 to {count - 1}", f"{segments.min():g} to {segments.max():g}")
+        raise wrong(path, f"integers from -1 to {count - 1}", f"{segments.min():g} to {segments.max():g}")
     return index.reshape(-1, *index.shape[-2:])
 
 
@@ -290,9 +267,9 @@ def open_npy(path: Path) -> NDArray:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except _UNREADABLE as error:
-        raise _wrong(path, "a .npy array without pickled objects", error) from error
+        raise wrong(path, "a .npy array without pickled objects", error) from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        raise _wrong(path, "an array of numbers", getattr(array, "dtype", type(array)))
+        raise wrong(path, "an array of numbers", getattr(array, "dtype", type(array)))
     return array
 
 
@@ -303,19 +280,20 @@ _UNREADABLE = (
 """Types that numpy raises on damaged arrays."""
 
 
-def _wrong(
+def wrong(
     path: Path, expected: str, found: object, remedy: str = "write it again (docs/captures.md has the layout)"
 ) -> FileFormatError:
+    """The error for an array with another content than is expected."""
     return FileFormatError(path, expected=expected, found=str(found)[:200], remedy=remedy)
 
 
 def _unit(array: NDArray, path: Path) -> torch.Tensor:
     """Unit vectors ``[h, w, D]`` in float32; normalizes in place if the array is float32 already."""
     if 0 in array.shape:
-        raise _wrong(path, "features [h, w, D]", list(array.shape))
+        raise wrong(path, "features [h, w, D]", list(array.shape))
     with np.errstate(over="ignore"):  # overflow becomes infinity, which is refused below
         values = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
     lengths = torch.linalg.vector_norm(values, dim=-1, keepdim=True)
     if not bool(torch.isfinite(lengths).all()):
-        raise _wrong(path, "finite numbers", "NaN, infinity, or values beyond 1e19")
+        raise wrong(path, "finite numbers", "NaN, infinity, or values beyond 1e19")
     return values.div_(lengths.clamp_min(1e-12))

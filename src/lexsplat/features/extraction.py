@@ -39,6 +39,7 @@ from lexsplat.features.pyramid import (
 )
 from lexsplat.features.settings import GRID_SETTINGS, RANDOM_SETTINGS, FeatureConfig
 from lexsplat.runtime import memory as budget
+from lexsplat.runtime.device import torch_threads
 from lexsplat.runtime.fingerprints import file_hash
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -90,16 +91,13 @@ def extract_features(
     config = config or FeatureConfig()
     cache_dir = Path(cache_dir)
     entries = {name: _Entry.of(view, clip, dino, config, cache_dir) for name, view in capture.views.items()}
-    missing = [name for name, entry in entries.items() if not entry.is_complete()]
-    done, total = len(entries) - len(missing), len(entries)
+    twins = _missing(entries)
+    missing, total = sum(map(len, twins.values())), len(entries)
+    done = total - missing
     listener(Event("features", done, total))
     largest = max([1, *(_view_bytes(capture.views[n], entries[n], clip, config, memory) for n in entries)])
-    workers = min(parallel_views(clip.device), max(1, len(missing)))
+    workers = min(parallel_views(clip.device), max(1, missing))
     workers = max(1, min(workers, memory // 2 // largest))
-    same_files: dict[tuple[Path, Path | None], list[str]] = {}  # views of identical photos share their files
-    for name in missing:
-        same_files.setdefault((entries[name].clip, entries[name].dino), []).append(name)
-    twins = {names[0]: names for names in same_files.values()}
     batch_size = batch_size_for(memory // workers, clip.image_size)
     extraction = _Extraction(capture.views, entries, clip, dino, config, batch_size)
     for name in extraction.run(list(twins), workers):
@@ -123,26 +121,27 @@ def missing_views(
     cache_dir: Path,
 ) -> dict[str, tuple[str, ...]]:
     """Views whose features are not cached, by the name of the first view of the same photo."""
+    views = capture.views.items()
+    return _missing({name: _Entry.of(view, clip, dino, config, Path(cache_dir)) for name, view in views})
+
+
+def _missing(entries: Mapping[str, _Entry]) -> dict[str, tuple[str, ...]]:
+    """See `missing_views`; views of identical photos share their files."""
     same_files: dict[tuple[Path, Path | None], tuple[str, ...]] = {}
-    for name, view in capture.views.items():
-        entry = _Entry.of(view, clip, dino, config, Path(cache_dir))
+    for name, entry in entries.items():
         if not entry.is_complete():
             same_files[entry.clip, entry.dino] = (*same_files.get((entry.clip, entry.dino), ()), name)
     return {names[0]: names for names in same_files.values()}
 
 
 def _view_bytes(view: View, entry: _Entry, clip: ImageTextEncoder, config: FeatureConfig, memory: int) -> int:
-    """Bytes that one view takes while it is processed: its photo, and the embeddings of its patches with a copy.
-
-    Raises:
-        MemoryBudgetError: If the photo does not fit, or the patches take more than half of ``memory``.
-    """
+    """Bytes that one view takes while it is processed: its photo, and the embeddings of its patches with a copy."""
     photo = view.lens.width, view.lens.height
     budget.check_photo(photo, memory, entry.image_size)
     need = budget.photo_bytes(photo, entry.image_size)
     if config.tokens == "class":
         return need
-    crops = sum(map(len, grid_levels(*entry.image_size, config.crop_sizes, config.crop_strides)))
+    crops = sum(map(len, crop_levels(entry.image_size, config, entry.seed)))
     patches = 2 * 4 * crops * (1 + clip.patches**2) * clip.dim
     what, remedy = f"the patches of {crops:,} crops", "features.crop-tokens class"
     budget.require("features", 2 * patches, memory, what, remedy)
@@ -176,8 +175,21 @@ def cpu_batch(image_size: int) -> int:
 
 def encoded_size(capture_size: tuple[int, int], config: FeatureConfig) -> tuple[int, int]:
     """Width and height at which a photo is cut into crops."""
-    factor = min(1.0, config.max_short_side / min(capture_size))
+    return reduced(capture_size, config.max_short_side)
+
+
+def reduced(capture_size: tuple[int, int], short_side: int) -> tuple[int, int]:
+    """Width and height of a photo whose short side is at most this long."""
+    factor = min(1.0, short_side / min(capture_size))
     return max(1, round(capture_size[0] * factor)), max(1, round(capture_size[1] * factor))
+
+
+def crop_levels(size: tuple[int, int], config: FeatureConfig, seed: int) -> tuple[CropLevel, ...]:
+    """The crops of a photo of this width and height; the seed is that of random ones."""
+    if config.mode == "grid":
+        return grid_levels(*size, config.crop_sizes, config.crop_strides)
+    fractions = np.linspace(*config.random_sizes, config.random_levels).tolist()
+    return random_levels(*size, fractions, config.random_crops, np.random.default_rng(seed))
 
 
 def size_of_map(capture_size: tuple[int, int], config: FeatureConfig) -> tuple[int, int]:
@@ -267,26 +279,21 @@ class _Extraction:
             return
         for view in missing:
             self._todo.put(view)
-        threads = torch.get_num_threads()
-        inner = max(1, threads // workers)
-        torch.set_num_threads(inner)
-        try:
-            with ThreadPoolExecutor(workers) as pool:
-                futures = [pool.submit(self._work, inner) for _ in range(workers)]
-                try:
-                    running = workers
-                    while running:
-                        finished = self._finished.get()
-                        if finished is None:
-                            running -= 1
-                        else:
-                            yield finished
-                finally:
-                    self._stop.set()  # also when the consumer stops early or is interrupted
-            for future in futures:
-                future.result()
-        finally:
-            torch.set_num_threads(threads)
+        inner = max(1, torch.get_num_threads() // workers)
+        with torch_threads(inner), ThreadPoolExecutor(workers) as pool:
+            futures = [pool.submit(self._work, inner) for _ in range(workers)]
+            try:
+                running = workers
+                while running:
+                    finished = self._finished.get()
+                    if finished is None:
+                        running -= 1
+                    else:
+                        yield finished
+            finally:
+                self._stop.set()  # also when the consumer stops early or is interrupted
+        for future in futures:
+            future.result()
 
     def _work(self, threads: int) -> None:
         torch.set_num_threads(threads)  # the setting is per thread
@@ -328,7 +335,7 @@ class _Extraction:
             if is_stored(entry.clip):
                 self._finished.put(name)
                 continue
-            levels = self._levels(entry)
+            levels = crop_levels(entry.image_size, self.config, entry.seed)
             boxes, places = unique_boxes(levels)
             crops = cut_crops(image.to(self.clip.device), boxes, self.clip.image_size, self.batch_size)
             yield (name, levels, torch.from_numpy(places)), crops
@@ -343,12 +350,3 @@ class _Extraction:
             layer=config.dino_layer,
             max_tokens=config.dino_max_tokens,
         )
-
-    def _levels(self, entry: _Entry) -> tuple[CropLevel, ...]:
-        config, (width, height) = self.config, entry.image_size
-        if config.mode == "grid":
-            return grid_levels(width, height, config.crop_sizes, config.crop_strides)
-        smallest, largest = config.random_sizes
-        fractions = np.linspace(smallest, largest, config.random_levels).tolist()
-        rng = np.random.default_rng(entry.seed)
-        return random_levels(width, height, fractions, config.random_crops, rng)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import logging
 import os
 import re
@@ -15,6 +14,7 @@ import shutil
 import time
 from collections.abc import Collection, Iterable, Iterator
 from difflib import get_close_matches
+from itertools import chain
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -23,6 +23,7 @@ from lexsplat.features.weights import INDEX, WEIGHTS, first_weights, weight_file
 from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.errors import FileFormatError, ModelError
 from lexsplat.runtime.files import atomic_path, read_json
+from lexsplat.runtime.fingerprints import blocks, digest
 from lexsplat.runtime.progress import NOTE
 
 log = logging.getLogger("lexsplat")
@@ -186,13 +187,7 @@ def content_hash(folder: Path, tower: str) -> str:
     with contextlib.suppress(OSError, UnicodeDecodeError):
         if kept is not None and re.fullmatch("[0-9a-f]{32}", known := kept.read_text()):
             return known
-    digest = hashlib.blake2b(digest_size=16)
-    for path in files:
-        digest.update(path.name.encode())
-        with path.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                digest.update(block)
-    found = digest.hexdigest()
+    found = digest((part for path in files for part in chain([path.name.encode()], blocks(path))), 16)
     if kept is not None and kept == _path_of_hash(files):  # no file has changed meanwhile
         with contextlib.suppress(OSError), atomic_path(kept) as temporary:
             temporary.write_text(found)
@@ -210,7 +205,7 @@ def _path_of_hash(files: Iterable[Path]) -> Path | None:
         for path, stat in facts
     ]
     with contextlib.suppress(RuntimeError):
-        return user_cache() / "hashes" / hashlib.blake2b(repr(rows).encode(), digest_size=16).hexdigest()
+        return user_cache() / "hashes" / digest([repr(rows).encode()], 16)
     return None
 
 
@@ -269,16 +264,7 @@ def _cached_folder(name: str, tower: str) -> tuple[Path | None, str]:
 
 
 def _download(name: str, tower: str, lacking: str) -> Path:
-    """Download a model from the hub; logs its license and size first.
-
-    Args:
-        name: The name.
-        tower: See `model_folder`.
-        lacking: What a copy in the cache lacks, in words; "" without a copy.
-
-    Raises:
-        ModelError: For each cause with a remedy of its own.
-    """
+    """Download a model from the hub; logs its license and size first. ``lacking``: what a copy in the cache lacks."""
     from huggingface_hub import HfApi, constants, snapshot_download
 
     cache = Path(constants.HF_HUB_CACHE)

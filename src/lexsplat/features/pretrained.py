@@ -26,6 +26,9 @@ from lexsplat.runtime.errors import ModelError
 
 log = logging.getLogger("lexsplat")
 
+IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Mean and standard deviation of the colors of ImageNet."""
+
 _CLEARLY = 0.8
 """Share of the time in float32 below which bfloat16 is chosen, so that noise does not decide."""
 
@@ -61,11 +64,7 @@ class PretrainedModel:
         return ModelError(f"model {self.name}", expected=expected, found=found, remedy=remedy)
 
     def _finite(self, compute: Callable[[], Tensor], *, crops: bool = False) -> Tensor:
-        """Features in half precision where that is faster, or in full precision from the first overflow on.
-
-        Raises:
-            ModelError: If they are not finite in full precision either.
-        """
+        """Features in half precision where that is faster, or in full precision from the first overflow on."""
         if not self._full_precision:
             with precision(self.device, crops=crops):
                 features = compute()

@@ -25,7 +25,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.features.encoders import resize_images
+from lexsplat.features.pretrained import resize_images
 
 Key = TypeVar("Key")
 

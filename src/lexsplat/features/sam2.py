@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.features.extraction import pixels_hash
-from lexsplat.features.hub import model_folder
-from lexsplat.features.pretrained import PretrainedModel, normalization, precision
+from lexsplat.features.pretrained import IMAGENET, PretrainedModel, normalization, precision
 
 if TYPE_CHECKING:
     from lexsplat.captures import View
@@ -34,16 +33,6 @@ ALIKE = 0.8
 """IoU from which on two masks of a level are the same."""
 
 _BATCH = 64  # points decoded at once
-_IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-
-
-def load_sam2(name: str = DEFAULT_SAM2, device: torch.device | str = "cpu") -> Sam2Segmenter:
-    """A SAM 2 by name or folder.
-
-    Raises:
-        ModelError: If it is not available and cannot be downloaded, or is not a SAM 2.
-    """
-    return Sam2Segmenter(model_folder(name, "segments"), name, device)
 
 
 class Sam2Segmenter(PretrainedModel):
@@ -72,7 +61,7 @@ class Sam2Segmenter(PretrainedModel):
         self.points = points or (32 if self.device.type == "cuda" else 16)
         side = self._model.config.prompt_encoder_config.image_size
         self.image_size = int(side if isinstance(side, int) else side[0])
-        self._mean, self._std = normalization(folder, _IMAGENET, self.device)
+        self._mean, self._std = normalization(folder, IMAGENET, self.device)
 
     def key(self, view: View) -> list[Any]:
         """The model, the settings and the photo."""

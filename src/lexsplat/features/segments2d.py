@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.features.cache import FeatureMap, FeatureMaps, hash_of, is_stored, read_labels, write_labels
-from lexsplat.features.external import open_npy, segment_numbers
-from lexsplat.features.extraction import pixels_hash, size_of_map
+from lexsplat.features.external import open_npy, segment_numbers, wrong
+from lexsplat.features.extraction import pixels_hash, reduced, size_of_map
+from lexsplat.features.hub import model_folder
 from lexsplat.features.settings import FeatureConfig
-from lexsplat.runtime.errors import FileFormatError, ModelError
+from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.fingerprints import file_hash
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -38,7 +39,6 @@ SUPERPIXELS = (3000, 1000)
 
 _COMPACTNESS = 10.0  # of superpixels: weight of distance beside that of color
 _SHORT_SIDE = 480  # pixels of the photo in which superpixels are searched: about four a cell
-_ENDINGS = (".png", ".npy", "_s.npy")
 
 
 class Segmenter(Protocol):
@@ -49,11 +49,9 @@ class Segmenter(Protocol):
 
     def key(self, view: View) -> list[Any]:
         """Everything the segments of a view depend on, as JSON-like values."""
-        ...
 
     def labels(self, view: View, size: tuple[int, int]) -> NDArray[np.int32]:
         """Segments at a width and height ``[L, height, width]``, numbered in each of L levels; -1 for none."""
-        ...
 
 
 def is_folder_of_segments(name: str) -> bool:
@@ -97,9 +95,9 @@ def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
     """
     model = sam2_name(name)
     if model is not None:
-        from lexsplat.features.sam2 import load_sam2
+        from lexsplat.features.sam2 import Sam2Segmenter
 
-        return load_sam2(model, device)
+        return Sam2Segmenter(model_folder(model, "segments"), model, device)
     return Superpixels() if name == "slic" else SegmentFolder(Path(name).expanduser())
 
 
@@ -110,7 +108,7 @@ class Superpixels:
 
     def key(self, view: View) -> list[Any]:
         """The photo and the settings."""
-        return ["slic", SUPERPIXELS, _COMPACTNESS, pixels_hash(view, _reduced(view.capture_size))]
+        return ["slic", SUPERPIXELS, _COMPACTNESS, pixels_hash(view, reduced(view.capture_size, _SHORT_SIDE))]
 
     def labels(self, view: View, size: tuple[int, int]) -> NDArray[np.int32]:
         """A level for each number of superpixels; see `Segmenter`."""
@@ -118,17 +116,12 @@ class Superpixels:
 
         from lexsplat.captures.images.reading import resize_nearest
 
-        image = view.load_image(_reduced(view.capture_size))
+        image = view.load_image(reduced(view.capture_size, _SHORT_SIDE))
         levels = [
             slic(image, number, compactness=_COMPACTNESS, start_label=0, channel_axis=-1)
             for number in SUPERPIXELS
         ]
         return np.stack([resize_nearest(level, size) for level in levels]).astype(np.int32)
-
-
-def _reduced(capture_size: tuple[int, int]) -> tuple[int, int]:
-    factor = min(1.0, _SHORT_SIDE / min(capture_size))
-    return max(1, round(capture_size[0] * factor)), max(1, round(capture_size[1] * factor))
 
 
 class SegmentFolder:
@@ -158,16 +151,12 @@ class SegmentFolder:
         Raises:
             FileFormatError: If there is none.
         """
-        paths = [self.folder / f"{view.stem}{ending}" for ending in _ENDINGS]
+        paths = [self.folder / f"{view.stem}{ending}" for ending in (".png", ".npy", "_s.npy")]
         found = next((path for path in paths if path.is_file()), None)
         if found is None:
-            raise FileFormatError(
-                self.folder,
-                expected=", ".join(f"{view.stem}{ending}" for ending in _ENDINGS[:-1])
-                + f" or {view.stem}{_ENDINGS[-1]}",
-                found="none of them",
-                remedy="give one map of segments a photo, named after it without its suffix",
-            )
+            expected = f"{view.stem}.png, {view.stem}.npy or {view.stem}_s.npy"
+            remedy = "give one map of segments a photo, named after it without its suffix"
+            raise wrong(self.folder, expected, "none of them", remedy)
         return found
 
     def labels(self, view: View, size: tuple[int, int]) -> NDArray[np.int32]:
@@ -183,12 +172,7 @@ class SegmentFolder:
         else:
             levels = open_npy(path)
             if levels.ndim not in (2, 3) or 0 in levels.shape:
-                raise FileFormatError(
-                    path,
-                    expected="segments [h, w] or [levels, h, w]",
-                    found=str(list(levels.shape)),
-                    remedy="write it again (docs/captures.md has the layout)",
-                )
+                raise wrong(path, "segments [h, w] or [levels, h, w]", list(levels.shape))
             levels = levels.reshape(-1, *levels.shape[-2:])
         sampled = np.stack([view.undistort_mask(level, path, size) for level in levels])
         return segment_numbers(sampled, path).astype(np.int32)
@@ -200,12 +184,8 @@ def _png_numbers(path: Path) -> NDArray[np.int32]:
 
     with open_image(path) as image:
         if image.mode not in ("1", "L", "P", "I") and not image.mode.startswith("I;"):
-            raise FileFormatError(
-                path,
-                expected="one number a pixel, 8 or 16 bits",
-                found=f"an image of mode {image.mode}",
-                remedy="write the numbers of segments, not colors",
-            )
+            remedy = "write the numbers of segments, not colors"
+            raise wrong(path, "one number a pixel, 8 or 16 bits", f"an image of mode {image.mode}", remedy)
         return np.asarray(image).astype(np.int32) - 1
 
 
@@ -229,12 +209,9 @@ def check_segments(config: FeatureConfig, capture: Capture) -> None:
             found = len(folder.labels(view, size_of_map(view.capture_size, config)))
             levels = levels or found
             if found != levels:
-                raise FileFormatError(
-                    folder.path(view),
-                    expected=f"{_count(levels)}, as {capture.train_views[0].stem} has",
-                    found=_count(found),
-                    remedy="give each photo the same levels of segments, in one order",
-                )
+                expected = f"{_count(levels)}, as {capture.train_views[0].stem} has"
+                remedy = "give each photo the same levels of segments, in one order"
+                raise wrong(folder.path(view), expected, _count(found), remedy)
 
 
 def _count(levels: int) -> str:
@@ -277,9 +254,8 @@ def pooled_features(
     for done, name in enumerate(maps, start=1):
         view = capture.views[name]
         size = size_of_map(view.capture_size, config)
-        paths[name] = (
-            Path(cache_dir) / f"{hash_of('segments', segmenter.key(view), size)}.segments.safetensors"
-        )
+        key = hash_of("segments", segmenter.key(view), size)
+        paths[name] = Path(cache_dir) / f"{key}.segments.safetensors"
         if not is_stored(paths[name]):
             write_labels(paths[name], segmenter.labels(view, size))
         listener(Event("2D segments", done, len(maps)))

@@ -34,7 +34,6 @@ class TextTower(Protocol):
 
     def encode_text(self, prompts: Sequence[str]) -> Tensor:
         """Prompts to unit embeddings ``[B, D]``."""
-        ...
 
 
 def load_text(name: str, device: torch.device | str = "cpu") -> TextTower:
@@ -137,11 +136,8 @@ class TextCache:
             if any(len(vector) != vectors.shape[1] for vector in found.values()):
                 new, vectors = wanted, encode_each(model, wanted, listener)
             found.update(zip(new, vectors))
-        in_order = {
-            prompt: found[prompt] for prompt in wanted
-        }  # so that files do not depend on what was known
-        for store in self._written:
-            store.add(content_hash, in_order)
+        for store in self._written:  # in one order, so that files do not depend on what was known
+            store.add(content_hash, {prompt: found[prompt] for prompt in wanted})
         return torch.stack([found[prompt] for prompt in prompts])
 
 
@@ -187,12 +183,7 @@ class _Store:
 
 
 def _read(path: Path) -> dict[str, Tensor]:
-    """The texts of a file and their embeddings.
-
-    Raises:
-        FileFormatError: If it is missing or damaged.
-        KeyError, ValueError, RecursionError: If it has other contents.
-    """
+    """The texts of a file and their embeddings."""
     tensors, facts = read_tensors(path)
     vectors, texts = tensors["embeddings"], json.loads(facts["texts"])
     if vectors.ndim != 2 or vectors.dtype != torch.float32 or not bool(vectors.isfinite().all()):

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 from lexsplat.captures import Capture
 from lexsplat.codebook import MAX_CODES
 from lexsplat.features import FeatureMaps, extract_features, load_external_features
+from lexsplat.features.cache import without_masked_cells
 from lexsplat.features.checks import ENOUGH, check_dense, rank_words
 from lexsplat.features.clip import check_patches
 from lexsplat.features.clip_text import UNLIKE_WORDS
 from lexsplat.features.estimate import estimate
 from lexsplat.features.extraction import missing_views
 from lexsplat.features.hub import model_folder
-from lexsplat.features.masking import without_masked_cells
 from lexsplat.features.segments2d import load_segmenter, pooled_features
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.progress import NOTE, Event, Listener, silent

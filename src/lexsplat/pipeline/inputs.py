@@ -24,7 +24,7 @@ from lexsplat.captures import (
     load_capture,
     poses_from_photos,
 )
-from lexsplat.captures.ground_truth.layouts import annotated_names, find_annotations
+from lexsplat.captures.ground_truth.layouts import annotated_names
 from lexsplat.captures.loading import check_capture
 from lexsplat.captures.readers.video import is_video, require_video, sample_video
 from lexsplat.captures.sfm.preparation import (
@@ -134,8 +134,7 @@ def preview_capture(
         return load_capture(source, test_every=config.test_every, test_names=test_names)
     photos = photo_folder(source)
     views = {name: _unposed_view(name, photos / name) for name in checked_photos(photos, output)}
-    found = find_annotations(source)
-    annotated = set() if found is None else annotated_names(*found, list(views), source / "images")
+    annotated = annotated_names(source, views)
     chosen, _ = choose_test_names(
         list(views),
         root=source,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from contextvars import ContextVar
+from functools import partial
 
 import torch
 
@@ -12,19 +13,19 @@ from lexsplat.runtime.errors import BackendError
 
 
 @contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch on one CPU thread inside the block; also usable as a decorator.
-
-    The last bit of a floating-point sum depends on the order of addition, which depends on the number of threads and
-    on the load of the machine. One thread gives reproducible bits.
-    """
+def torch_threads(count: int) -> Iterator[None]:
+    """Run torch on ``count`` CPU threads inside the block; also usable as a decorator."""
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     try:
         yield
     finally:
         torch.set_num_threads(threads)
 
+
+one_thread = partial(torch_threads, 1)
+"""The last bit of a floating-point sum depends on the order of addition, which depends on the number of threads and
+on the load of the machine. One thread gives reproducible bits."""
 
 _kernel_threads: ContextVar[int | None] = ContextVar("kernel_threads", default=None)
 

@@ -6,6 +6,8 @@ arguments of Python functions raise ``ValueError``.
 
 from __future__ import annotations
 
+from functools import partial
+
 STOPPED = "stopped; run the same command again to go on"
 """Message after Ctrl-C."""
 
@@ -34,11 +36,8 @@ class LexsplatError(Exception):
         super().__init__(str(self))
 
     def __str__(self) -> str:
-        clauses = []
-        if self.expected:
-            clauses.append(f"expected {self.expected}")
-        if self.found:
-            clauses.append(f"found {self.found}")
+        sides = (("expected", self.expected), ("found", self.found))
+        clauses = [f"{word} {text}" for word, text in sides if text]
         message = ": ".join(part for part in (self.subject, ", ".join(clauses)) if part)
         if self.remedy:
             message = f"{message}; {self.remedy}"
@@ -46,11 +45,7 @@ class LexsplatError(Exception):
 
     def __reduce__(self) -> tuple:
         fields = {"expected": self.expected, "found": self.found, "remedy": self.remedy}
-        return (_rebuild, (type(self), self.subject, fields))
-
-
-def _rebuild(kind: type[LexsplatError], subject: str, fields: dict[str, str]) -> LexsplatError:
-    return kind(subject, **fields)
+        return (partial(type(self), self.subject, **fields), ())
 
 
 class CaptureError(LexsplatError):

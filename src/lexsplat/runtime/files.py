@@ -228,9 +228,6 @@ def _sort_metadata(path: Path) -> None:
 
     The file starts with the length of the header as a 64-bit little-endian integer, followed by the header as JSON,
     padded with spaces. Sorting does not change its length.
-
-    Raises:
-        FileFormatError: If the sorted header does not fit, which would be a change of the format.
     """
     with open(path, "r+b") as file:
         length = int.from_bytes(file.read(8), "little")

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,5 +41,11 @@ def file_stamp(path: Path) -> tuple[int, int]:
 
 def file_hash(path: Path, digest_size: int = 12) -> str:
     """Hash of a file's content, ``2 * digest_size`` hex digits."""
+    return digest(blocks(path), digest_size)
+
+
+def blocks(path: Path) -> Iterator[bytes]:
+    """The content of a file, a MiB at a time."""
     with open(path, "rb") as file:
-        return digest(iter(lambda: file.read(1 << 20), b""), digest_size)
+        while block := file.read(1 << 20):
+            yield block

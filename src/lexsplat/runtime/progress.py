@@ -53,18 +53,14 @@ class Pace:
 
     def __init__(self) -> None:
         self._starts: dict[_Key, tuple[float, int]] = {}  # time and units done at the first event of a stage
-        self._done: dict[_Key, int] = {}
-        self._ended: set[_Key] = set()
+        self._last: dict[_Key, Event] = {}
 
     def rate(self, event: Event) -> float:
         """Units a second since the first event of the stage; 0 at that event. A stage can start anew."""
         now, key = time.monotonic(), (event.scene, event.stage)
-        if event.done < self._done.get(key, 0) or key in self._ended:
+        last, self._last[key] = self._last.get(key), event
+        if last is not None and (event.done < last.done or last.done >= last.total):
             del self._starts[key]
-        self._ended.discard(key)
-        if event.done >= event.total:
-            self._ended.add(key)
-        self._done[key] = event.done
         started, done_before = self._starts.setdefault(key, (now, event.done))
         return (event.done - done_before) / (now - started) if now > started else 0.0
 

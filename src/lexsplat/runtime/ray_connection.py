@@ -45,11 +45,7 @@ def connect(place: str, tries: int = 2) -> None:
 
 
 def _greet(place: str, host: str, port: int) -> None:
-    """Check that a server of gRPC listens, as those of Ray are: it answers the preface of HTTP/2 with its settings.
-
-    Raises:
-        WorkersError: If nothing or something else listens.
-    """
+    """Check that a server of gRPC listens, as Ray's are: it answers the preface of HTTP/2 with its settings."""
     try:
         with socket.create_connection((host, port), timeout=_WAIT_SECONDS) as server:
             server.sendall(_PREFACE)

@@ -35,10 +35,8 @@ Answer = tuple[Outcome, list[tuple[int, str]]]
 
 def slots(needs: Needs) -> int:
     """How many tasks with these needs the nodes of the cluster hold at a time."""
-    import ray
-
     found = 0.0
-    for node in (node["Resources"] for node in ray.nodes() if node["Alive"]):
+    for node in _nodes():
         fits = node.get("CPU", 0.0)
         if needs.gpu:
             fits = min(fits, node.get("GPU", 0.0))
@@ -46,6 +44,13 @@ def slots(needs: Needs) -> int:
             fits = min(fits, node.get("memory", 0.0) // needs.memory)
         found += int(fits)
     return int(found)
+
+
+def _nodes() -> list[dict[str, float]]:
+    """The resources of every node that lives."""
+    import ray
+
+    return [node["Resources"] for node in ray.nodes() if node["Alive"]]
 
 
 class Tasks:
@@ -175,9 +180,7 @@ def _failed(name: str, error: Exception) -> Outcome:
 
 def options_of(needs: Needs, tasks: int) -> dict[str, Any]:
     """Options of Ray for tasks with these needs; checks that a node, and the object stores, can meet them."""
-    import ray
-
-    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    nodes = _nodes()
     options: dict[str, Any] = {"num_cpus": 1, "max_retries": RETRIES}
     if needs.gpu and any(node.get("GPU") for node in nodes):
         options["num_gpus"] = 1
@@ -194,17 +197,12 @@ def options_of(needs: Needs, tasks: int) -> dict[str, Any]:
 
 def _most_memory() -> int:
     """Memory of the largest node that can compute."""
-    import ray
-
-    nodes = (node["Resources"] for node in ray.nodes() if node["Alive"])
-    return int(max((node.get("memory", 0) for node in nodes if node.get("CPU")), default=0))
+    return int(max((node.get("memory", 0) for node in _nodes() if node.get("CPU")), default=0))
 
 
 def _store() -> int:
     """Size of all object stores."""
-    import ray
-
-    return int(sum(node["Resources"].get("object_store_memory", 0) for node in ray.nodes() if node["Alive"]))
+    return int(sum(node.get("object_store_memory", 0) for node in _nodes()))
 
 
 def no_node(needs: Needs) -> WorkersError:

@@ -10,7 +10,7 @@ import logging
 import tempfile
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -191,7 +191,7 @@ def open_workers(spec: str, paths: tuple[Path, ...] = ()) -> AbstractContextMana
     """
     check_spec(spec)
     if spec == "none":
-        return _in_process()
+        return nullcontext(IN_PROCESS)
     from lexsplat.runtime.ray_workers import ray_workers
 
     return ray_workers(None if spec == "ray" else spec, paths)
@@ -207,11 +207,6 @@ def check_spec(spec: str) -> None:
     address = spec.startswith("ray://") and host and colon and port.isdigit()
     if spec not in ("none", "ray") and not address:
         raise ValueError(f"workers must be none, ray or ray://HOST:PORT, got {spec!r}")
-
-
-@contextmanager
-def _in_process() -> Iterator[Workers]:
-    yield IN_PROCESS
 
 
 @dataclass(frozen=True)

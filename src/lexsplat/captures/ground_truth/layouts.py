@@ -15,7 +15,7 @@ import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,14 +47,12 @@ class Annotations:
             undistorted image.
         boxes: ``{view: {prompt: boxes}}``, ``[B, 4]`` as x0, y0, x1, y1 in pixels of the mask, if the data set has
             boxes.
-        classes: Names of all classes, if the data set lists them.
     """
 
     layout: str
     origin: Path
     masks: Mapping[str, Mapping[str, Path | NDArray[np.bool_]]]
     boxes: Mapping[str, Mapping[str, NDArray[np.float64]]] = field(default_factory=dict)
-    classes: tuple[str, ...] = ()
 
     def prompts(self) -> tuple[str, ...]:
         """All prompts with ground truth in any view, sorted."""
@@ -74,22 +72,21 @@ class Annotations:
             }
             return {view: prompts for view, prompts in kept.items() if prompts}
 
-        classes = tuple(names[name] for name in self.classes if name in names)
-        return Annotations(self.layout, self.origin, change(self.masks), change(self.boxes), classes)
+        return Annotations(self.layout, self.origin, change(self.masks), change(self.boxes))
 
 
-def find_annotations(root: Path) -> tuple[str, Path] | None:
-    """Layout and folder of the ground truth that belongs to a capture, or None.
+def find_annotations(root: Path) -> Path | None:
+    """The folder of the ground truth that belongs to a capture, or None.
 
     Masks in ``segmentations/`` of the capture take precedence over LERF-OVS labels in ``label/`` beside it.
     """
     segmentations = root / "segmentations"
     if segmentations.is_dir() and mask_folders(segmentations):
-        return layout_of(segmentations), segmentations
+        return segmentations
     absolute = root.resolve()
     for folder in (absolute.parent / "label" / absolute.name, root / "label" / absolute.name, root / "label"):
         if folder.is_dir() and any(folder.glob("frame_*.json")):
-            return "lerf-ovs", folder
+            return folder
     return None
 
 
@@ -100,13 +97,17 @@ def layout_of(folder: Path) -> str:
     return "3d-ovs" if (folder / CLASSES_FILE).is_file() else "segmentations"
 
 
-def annotated_names(layout: str, folder: Path, names: Collection[str], image_folder: Path) -> set[str]:
-    """Which of the images ``names`` have ground truth. `load_annotations` reports ground truth without an image."""
+def annotated_names(root: Path, names: Collection[str]) -> set[str]:
+    """Which images of a capture have ground truth. `load_annotations` reports ground truth without an image."""
+    folder = find_annotations(root)
+    if folder is None:
+        return set()
+    layout = layout_of(folder)
     if layout == "lerf-ovs":
         stems = [path.stem for path in folder.glob("frame_*.json")]
     else:
         stems = [path.relative_to(folder).as_posix() for path in mask_folders(folder)]
-    found = (_images_meant(stem, layout, names, image_folder) for stem in stems)
+    found = (_images_meant(stem, layout, names, root / "images") for stem in stems)
     return {matches[0] for matches in found if len(matches) == 1}
 
 
@@ -192,13 +193,11 @@ def _with_prompts_of(ground_truth: Annotations, root: Path, prompt_list: PromptL
 
 
 def _read_ground_truth(capture: Capture, folder: Path | None) -> Annotations:
+    folder = folder or find_annotations(capture.root)
     if folder is None:
-        layout, folder = find_annotations(capture.root) or ("segmentations", capture.root / "segmentations")
-    else:
-        layout = layout_of(folder)
-    if layout == "lerf-ovs":
-        return _read_lerf_ovs(capture, folder)
-    return _read_masks(capture, folder, layout)
+        return Annotations("segmentations", capture.root / "segmentations", {})
+    layout = layout_of(folder)
+    return _read_lerf_ovs(capture, folder) if layout == "lerf-ovs" else _read_masks(capture, folder, layout)
 
 
 # Folders of masks
@@ -225,16 +224,11 @@ def _read_masks(capture: Capture, folder: Path, layout: str) -> Annotations:
             view.check_mask(path)
         masks.setdefault(view.name, {}).update(files)
     ordered = {name: dict(sorted(masks[name].items())) for name in sorted(masks)}
-    return Annotations(layout, folder, ordered, classes=tuple(sorted(classes)))
+    return Annotations(layout, folder, ordered)
 
 
 def _read_classes(path: Path) -> tuple[str, ...]:
-    """The names in ``classes.txt``, each the name of a file in a view's folder.
-
-    Raises:
-        CaptureError: If a name points outside the folder.
-        FileFormatError: If it is not UTF-8 text.
-    """
+    """The names in ``classes.txt``, each the name of a file in a view's folder."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -285,32 +279,25 @@ def _read_lerf_ovs(capture: Capture, folder: Path) -> Annotations:
             if view.lens.distorts:  # the label's box is around the object in the distorted photo
                 box = _box_around(mask)
             parts.setdefault(category, []).append((mask, box))
-        masks[view.name] = {
-            category: np.logical_or.reduce([mask for mask, _ in found])
-            for category, found in sorted(parts.items())
-        }
-        boxes[view.name] = {
-            category: np.stack([box for _, box in found]) for category, found in sorted(parts.items())
-        }
+        masks[view.name], boxes[view.name] = {}, {}
+        for category, found in sorted(parts.items()):
+            masks[view.name][category] = np.logical_or.reduce([mask for mask, _ in found])
+            boxes[view.name][category] = np.stack([box for _, box in found])
     return Annotations("lerf-ovs", folder, masks, boxes)
 
 
-class _LabeledObject(NamedTuple):
-    """One object of a label file: category, box ``[4]`` and polygon ``[n, 2]``, in pixels."""
-
-    category: str
-    box: NDArray[np.float64]
-    polygon: NDArray[np.float64]
+_Object = tuple[str, NDArray[np.float64], NDArray[np.float64]]
+"""One object of a label file: category, box ``[4]`` and polygon ``[n, 2]``, in pixels."""
 
 
-def _read_labels(path: Path) -> tuple[str, tuple[int, int], list[_LabeledObject]]:
+def _read_labels(path: Path) -> tuple[str, tuple[int, int], list[_Object]]:
     """Name, width and height of the image of a label file, and the objects."""
     content = read_json(path, remedy="copy the file again or correct it")
     try:
         info = content["info"]
         name, size = str(info["name"]), (int(info["width"]), int(info["height"]))
         objects = [
-            _LabeledObject(
+            (
                 str(entry["category"]),
                 np.asarray(entry["bbox"], dtype=np.float64).reshape(4),
                 np.asarray(entry["segmentation"], dtype=np.float64).reshape(-1, 2),
@@ -324,7 +311,7 @@ def _read_labels(path: Path) -> tuple[str, tuple[int, int], list[_LabeledObject]
             found=repr(error)[:200],
             remedy="use LangSplat's label files",
         ) from error
-    numbers = [part for found in objects for part in (found.box, found.polygon)]
+    numbers = [part for _, *parts in objects for part in parts]
     if min(size) < 1 or max(size) > MAX_SIDE or size[0] * size[1] > MAX_PIXELS:
         raise FileFormatError(
             path, expected="a size and finite coordinates", found=f"size {size[0]}x{size[1]}"[:60]

@@ -219,3 +219,13 @@ def sizes_agree(found: tuple[int, int], expected: tuple[int, int]) -> bool:
     for a, b in zip(found, expected):
         low, high = max(low, (a - 1) / b), min(high, (a + 1) / b)
     return bool(low < high)
+
+
+def misfit(mask: Path, found: tuple[int, int], photo: str, size: tuple[int, int]) -> CaptureError:
+    """The error for a mask whose aspect is not that of its photo, from their widths and heights."""
+    return CaptureError(
+        mask,
+        expected=f"a mask of {photo}, {size[0]}x{size[1]} pixels or scaled uniformly",
+        found=f"{found[0]}x{found[1]}",
+        remedy="draw the mask on this photo, or remove it",
+    )

@@ -44,7 +44,6 @@ class CameraFiles:
         root: The capture folder.
         origin: The file or folder of the cameras, for messages.
         photos: The photos whose file exists.
-        source: ``"colmap"`` or ``"transforms"``.
         points: Points ``[P, 3]`` float32, world.
         point_colors: Their colors ``[P, 3]`` float32 in 0..1.
         missing: Names of images that have a camera but no file.
@@ -56,7 +55,6 @@ class CameraFiles:
     root: Path
     origin: Path
     photos: list[Photo]
-    source: str
     points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     point_colors: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     missing: list[str] = field(default_factory=list)

@@ -15,7 +15,7 @@ import re
 import struct
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +38,6 @@ MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "dist
 
 IMAGE_FOLDERS = ("images", "input", "image", "rgb", "images_2", "images_4", "images_8", ".")
 """Folders of a capture that are searched for photos, in this order."""
-
-_COPY_AGAIN = "copy the file again, or run COLMAP again"
 
 
 def find_model(root: Path) -> Path | None:
@@ -67,43 +65,27 @@ def read_colmap(root: Path, model: Path, images: Path | None = None) -> CameraFi
     lenses = _lenses_by_id(model / f"cameras{suffix}")
     images_file = model / f"images{suffix}"
     if not images_file.is_file():
-        raise FileFormatError(
-            images_file, expected="the model's images", found="no such file", remedy=_COPY_AGAIN
-        )
+        raise _damaged(images_file, "the model's images", "no such file")
     entries = list(_read_images(images_file))
-    names = [checked_name(entry.name, images_file) for entry in entries]
+    names = [checked_name(name, images_file) for name, _, _ in entries]
     folder = _image_folder(root, names) if images is None else images
     photos, missing = [], []
-    for name, entry in zip(names, entries):
-        if entry.camera_id not in lenses:
-            raise FileFormatError(
-                images_file,
-                expected=f"camera {entry.camera_id} of image {name} in cameras{suffix}",
-                found=f"cameras {sorted(lenses)[:8]}",
-                remedy=_COPY_AGAIN,
-            )
-        viewmat = _viewmat(entry.quaternion, entry.translation, name, images_file)
+    for name, (_, camera_id, pose) in zip(names, entries):
+        if camera_id not in lenses:
+            expected = f"camera {camera_id} of image {name} in cameras{suffix}"
+            raise _damaged(images_file, expected, f"cameras {sorted(lenses)[:8]}")
+        viewmat = _viewmat(pose, name, images_file)
         if (folder / name).is_file():
-            photos.append(Photo(name, folder / name, lenses[entry.camera_id], viewmat))
+            photos.append(Photo(name, folder / name, lenses[camera_id], viewmat))
         else:
             missing.append(name)
+    found = CameraFiles(root=root, origin=model, photos=photos, missing=missing)
     points_file = model / f"points3D{suffix}"
-    points, colors, dropped = (
-        _read_points(points_file) if points_file.is_file() else (np.zeros((0, 3)), np.zeros((0, 3)), 0)
-    )
-    warnings = (
-        [f"{points_file}: {dropped} points with NaN, infinity or huge coordinates dropped"] if dropped else []
-    )
-    return CameraFiles(
-        root=root,
-        origin=model,
-        photos=photos,
-        source="colmap",
-        points=points.astype(np.float32),
-        point_colors=colors.astype(np.float32),
-        missing=missing,
-        warnings=warnings,
-    )
+    if not points_file.is_file():
+        return found
+    points, colors, dropped = _read_points(points_file)
+    warning = f"{points_file}: {dropped} points with NaN, infinity or huge coordinates dropped"
+    return replace(found, points=points, point_colors=colors, warnings=[warning] if dropped else [])
 
 
 def _lenses_by_id(file: Path) -> dict[int, Lens]:
@@ -121,19 +103,18 @@ def _image_folder(root: Path, names: list[str]) -> Path:
     return max(folders, key=lambda folder: sum((folder / name).is_file() for name in names))
 
 
-def _viewmat(
-    quaternion: tuple[float, ...], translation: tuple[float, ...], name: str, origin: Path
-) -> NDArray[np.float64]:
+def _viewmat(pose: tuple[float, ...], name: str, origin: Path) -> NDArray[np.float64]:
     """World to camera ``[4, 4]`` from COLMAP's quaternion (wxyz, normalized here) and translation."""
     viewmat = np.eye(4)
     with np.errstate(all="ignore"):  # damaged numbers overflow here; the check below names the image
-        viewmat[:3, :3] = matrix_from_quaternion(np.array(quaternion))
-    viewmat[:3, 3] = translation
+        viewmat[:3, :3] = matrix_from_quaternion(np.array(pose[:4]))
+    viewmat[:3, 3] = pose[4:]
     return checked_pose(viewmat, name, origin)
 
 
 def _damaged(file: Path, expected: str, found: str) -> FileFormatError:
-    return FileFormatError(file, expected=expected, found=found, remedy=_COPY_AGAIN)
+    remedy = "copy the file again, or run COLMAP again"
+    return FileFormatError(file, expected=expected, found=found, remedy=remedy)
 
 
 class _Bytes:
@@ -200,14 +181,8 @@ _OBSERVATION_BYTES = 24  # x, y, point id
 _TRACK_BYTES = 8  # image id, observation index
 
 
-@dataclass(frozen=True)
-class _ImageEntry:
-    """An image of a model: its name, its camera, and its pose, world to camera."""
-
-    name: str
-    camera_id: int
-    quaternion: tuple[float, ...]  # wxyz
-    translation: tuple[float, ...]
+_Image = tuple[str, int, tuple[float, ...]]
+"""Name, camera and pose of an image: world to camera, quaternion (wxyz) and translation."""
 
 
 def _read_cameras(file: Path) -> Iterator[tuple[int, Lens]]:
@@ -238,7 +213,7 @@ def _read_cameras(file: Path) -> Iterator[tuple[int, Lens]]:
     content.finish()
 
 
-def _read_images(file: Path) -> Iterator[_ImageEntry]:
+def _read_images(file: Path) -> Iterator[_Image]:
     if file.suffix == ".txt":
         yield from _read_images_text(file)
         return
@@ -248,11 +223,11 @@ def _read_images(file: Path) -> Iterator[_ImageEntry]:
         name = content.text("an image name")
         observations = content.count(_OBSERVATION_BYTES, f"observations of {name[:60]}")
         content.skip(observations * _OBSERVATION_BYTES, f"observations of {name[:60]}")
-        yield _ImageEntry(name, camera_id, tuple(pose[:4]), tuple(pose[4:]))
+        yield name, camera_id, tuple(pose)
     content.finish()
 
 
-def _read_images_text(file: Path) -> Iterator[_ImageEntry]:
+def _read_images_text(file: Path) -> Iterator[_Image]:
     lines = _lines(file)
     for line in _records(file, lines):
         words = line.strip().split(maxsplit=9)
@@ -266,7 +241,7 @@ def _read_images_text(file: Path) -> Iterator[_ImageEntry]:
         if observations is None or not _are_observations(observations):
             instead = "the end of the file" if observations is None else repr(observations[:60])
             raise _damaged(file, f"a line of observations after image {name}", instead)
-        yield _ImageEntry(name, camera_id, pose[:4], pose[4:])
+        yield name, camera_id, pose
 
 
 def _are_observations(line: str) -> bool:
@@ -279,15 +254,15 @@ def _are_observations(line: str) -> bool:
     return len(words) % 3 == 0
 
 
-def _read_points(file: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+def _read_points(file: Path) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
     """Points, colors in 0..1, and the number of points dropped for numbers that are not finite."""
     numbers = array("d")  # 8 bytes per number; a list of tuples takes 50
     for row in _point_rows_text(file) if file.suffix == ".txt" else _point_rows_binary(file):
         numbers.extend(row)
     table = np.array(numbers, dtype=np.float64).reshape(-1, 6)
     keep = np.isfinite(table).all(1) & (np.abs(table[:, :3]) < MAX_COORDINATE).all(1)
-    kept = table[keep]
-    return kept[:, :3], np.clip(kept[:, 3:] / 255.0, 0.0, 1.0), int((~keep).sum())
+    points, colors = table[keep, :3], np.clip(table[keep, 3:] / 255.0, 0.0, 1.0)
+    return points.astype(np.float32), colors.astype(np.float32), int((~keep).sum())
 
 
 def _point_rows_binary(file: Path) -> Iterator[tuple[float, ...]]:

@@ -10,6 +10,7 @@ import math
 import re
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -87,14 +88,13 @@ def read_transforms(file: Path) -> CameraFiles:
         synthetic |= reader.sizes_come_from_images
     shared = _shared_folder([photo.name for photo in photos] + missing)
     if shared:
-        photos = [Photo(p.name[len(shared) :], p.path, p.lens, p.viewmat, p.ignore_path) for p in photos]
-        missing = [name[len(shared) :] for name in missing]
+        photos = [replace(photo, name=photo.name.removeprefix(shared)) for photo in photos]
+        missing = [name.removeprefix(shared) for name in missing]
         test_names = None if test_names is None else [name.removeprefix(shared) for name in test_names]
     return CameraFiles(
         root=root,
         origin=file,
         photos=photos,
-        source="transforms",
         missing=missing,
         test_names=test_names,
         # NeRF-synthetic images are transparent, and its benchmarks composite them on white.
@@ -126,12 +126,8 @@ class _Reader:
         self.sizes_come_from_images = not any("w" in place or "fl_x" in place for place in places)
         for key in _UNSUPPORTED_LENSES:
             if document.get(key):
-                raise CaptureError(
-                    file,
-                    expected="perspective or fisheye images",
-                    found=f'"{key}"',
-                    remedy="cut the images into perspective views before building",
-                )
+                remedy = "cut the images into perspective views before building"
+                raise self._wrong("perspective or fisheye images", f'"{key}"', remedy)
 
     def frames(self) -> list[Mapping[str, Any]]:
         """The frames, checked to be objects with a ``file_path``."""
@@ -181,12 +177,8 @@ class _Reader:
             or not isinstance(value, (int, float))
             or not abs(value) <= sys.float_info.max
         ):
-            raise CaptureError(
-                self.file,
-                expected=f'a finite number for "{key}"',
-                found=repr(value)[:60],
-                remedy="correct the file or export the capture again",
-            )
+            remedy = "correct the file or export the capture again"
+            raise self._wrong(f'a finite number for "{key}"', repr(value)[:60], remedy)
         return float(value)
 
     def _lens(self, frame: Mapping[str, Any], name: str, path: Path) -> Lens:
@@ -197,12 +189,8 @@ class _Reader:
         focal_y = self._focal(frame, "fl_y", "camera_angle_y", height)
         focal_x, focal_y = focal_y if focal_x is None else focal_x, focal_x if focal_y is None else focal_y
         if focal_x is None or focal_y is None:
-            raise CaptureError(
-                self.file,
-                expected=f'"fl_x" or "camera_angle_x" for image {name}',
-                found="neither",
-                remedy="add the focal length in pixels as fl_x",
-            )
+            expected = f'"fl_x" or "camera_angle_x" for image {name}'
+            raise self._wrong(expected, "neither", "add the focal length in pixels as fl_x")
         center = (self._number(frame, "cx", width / 2), self._number(frame, "cy", height / 2))
         model = self._model(frame)
         k1, k2, k3, k4, k5, k6, p1, p2 = (
@@ -234,12 +222,8 @@ class _Reader:
             return "OPENCV_FISHEYE"
         model = frame.get("camera_model", self.document.get("camera_model", "OPENCV"))
         if not isinstance(model, str) or model.upper() not in _MODELS:
-            raise CaptureError(
-                self.file,
-                expected=f"a camera_model of {', '.join(sorted(_MODELS))}",
-                found=repr(model)[:60],
-                remedy="undistort the images to PINHOLE before building",
-            )
+            expected = f"a camera_model of {', '.join(sorted(_MODELS))}"
+            raise self._wrong(expected, repr(model)[:60], "undistort the images to PINHOLE before building")
         return _MODELS[model.upper()]
 
     def _viewmat(self, frame: Mapping[str, Any], name: str) -> NDArray[np.float64]:
@@ -254,17 +238,14 @@ class _Reader:
         U, singular, Vt = np.linalg.svd(pose[:3, :3])
         rotation = U @ Vt
         if not singular[2] > 0.95 * singular[0] or np.linalg.det(rotation) < 0:
-            raise CaptureError(
-                self.file,
-                expected=f"a rotation in the transform_matrix of image {name}",
-                found=f"scales of {singular[0]:.3g} and {singular[2]:.3g}, determinant "
-                f"{np.linalg.det(pose[:3, :3]):.3g}",
-                remedy="export the capture again",
-            )
+            scales = f"scales of {singular[0]:.3g} and {singular[2]:.3g}"
+            found = f"{scales}, determinant {np.linalg.det(pose[:3, :3]):.3g}"
+            expected = f"a rotation in the transform_matrix of image {name}"
+            raise self._wrong(expected, found, "export the capture again")
         camera_to_world = np.eye(4)
         camera_to_world[:3, :3] = rotation
         camera_to_world[:3, 3] = pose[:3, 3]
         return np.asarray(np.linalg.inv(camera_to_world @ OPENGL_TO_OPENCV), dtype=np.float64)
 
-    def _wrong(self, expected: str, found: str) -> CaptureError:
-        return CaptureError(self.file, expected=expected, found=found, remedy="correct the file")
+    def _wrong(self, expected: str, found: str, remedy: str = "correct the file") -> CaptureError:
+        return CaptureError(self.file, expected=expected, found=found, remedy=remedy)

@@ -12,7 +12,6 @@ import itertools
 import json
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,19 +41,6 @@ _WHOLE = 0.9
 """Least share of its frames that must be readable for a video to count as complete."""
 _MANIFEST = "frames.json"
 _JPEG_QUALITY = 95
-
-
-@dataclass(frozen=True)
-class FrameMeasures:
-    """Measures of each frame, from the first pass.
-
-    Args:
-        sharpness: Variance of the Laplacian of the gray frame, relative to its contrast ``[F]``.
-        motion: Change from the frame before, relative to its contrast ``[F]``; the first is 0.
-    """
-
-    sharpness: NDArray[np.float64]
-    motion: NDArray[np.float64]
 
 
 def is_video(path: Path) -> bool:
@@ -123,14 +109,14 @@ def sample_video(
     kept = _written_before(folder, inputs)
     if kept is not None:
         return kept
-    measures = measure_frames(video, listener, memory=memory)
-    chosen = choose_frames(measures, count)
+    sharpness, motion = measure_frames(video, listener, memory=memory)
+    chosen = choose_frames(sharpness, motion, count)
     names = [f"frame_{index:06d}.jpg" for index in chosen]
     (folder / _MANIFEST).unlink(missing_ok=True)
     for stale in folder.glob("frame_*.jpg"):
         if stale.name not in names:
             stale.unlink()
-    _write_frames(video, folder, dict(zip(chosen, names)), len(measures.motion), memory, listener)
+    _write_frames(video, folder, dict(zip(chosen, names)), len(motion), memory, listener)
     with atomic_path(folder / _MANIFEST) as temporary:
         temporary.write_text(json.dumps({**inputs, "names": names}, indent=1), encoding="utf-8")
     return names
@@ -138,8 +124,12 @@ def sample_video(
 
 def measure_frames(
     video: Path, listener: Listener = silent, *, memory: int = budget.DEFAULT_MEMORY
-) -> FrameMeasures:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Measure all frames of a video: the first pass.
+
+    Returns:
+        Sharpness ``[F]``, the variance of the Laplacian of the gray frame relative to its contrast, and motion
+        ``[F]``, the change from the frame before relative to its contrast; the first is 0.
 
     Raises:
         BackendError: If PyAV is not installed.
@@ -148,7 +138,6 @@ def measure_frames(
     sharpness: list[float] = []
     motion: list[float] = []
     before: NDArray[np.float32] | None = None
-    expected = 0
     with _open(video, memory) as (stream, frames):
         expected = stream.frames
         for frame in frames:
@@ -167,24 +156,24 @@ def measure_frames(
         )
     if len(motion) < 3:
         raise CaptureError(video, expected="a video of at least 3 frames", found=f"{len(motion)}")
-    return FrameMeasures(np.array(sharpness), np.array(motion))
+    return np.array(sharpness), np.array(motion)
 
 
-def choose_frames(measures: FrameMeasures, count: int) -> list[int]:
+def choose_frames(sharpness: NDArray[np.float64], motion: NDArray[np.float64], count: int) -> list[int]:
     """Indices of the chosen frames, ascending: the sharpest of each of ``count`` segments of equal motion.
 
     A segment without a frame, where the camera moved fast, is made up for by one more frame in the widest remaining
     gap, so that the result has ``count`` frames, or all.
     """
-    frames = len(measures.motion)
+    frames = len(motion)
     if count >= frames:
         return list(range(frames))
-    path = np.cumsum(measures.motion)
+    path = np.cumsum(motion)
     if path[-1] <= 0:  # no motion: evenly by time
         path = np.arange(frames, dtype=np.float64)
     place = path / path[-1] * count
     window = np.minimum(place.astype(np.int64), count - 1)
-    score = measures.sharpness * (1 - _TAPER * np.abs(2 * (place - window) - 1).clip(0, 1))
+    score = sharpness * (1 - _TAPER * np.abs(2 * (place - window) - 1).clip(0, 1))
     order = np.lexsort((-score, window))
     first = np.unique(window[order], return_index=True)[1]
     chosen = sorted(int(index) for index in order[first])
@@ -206,12 +195,7 @@ def _fill_widest_gap(chosen: list[int], place: NDArray, score: NDArray) -> int:
 
 @contextlib.contextmanager
 def _open(video: Path, memory: int) -> Iterator[tuple[Any, Iterator[Any]]]:
-    """The video stream and its decoded frames, in order.
-
-    Raises:
-        BackendError: If PyAV is not installed.
-        CaptureError: If it cannot be opened or decoded, also during iteration.
-    """
+    """The video stream and its decoded frames, in order."""
     av = _require_pyav(video)
     try:
         with av.open(str(video)) as container:
@@ -231,11 +215,7 @@ def _open(video: Path, memory: int) -> Iterator[tuple[Any, Iterator[Any]]]:
 
 
 def _threads(video: Path, frame: tuple[int, int], memory: int) -> int:
-    """Number of decoding threads whose frames fit into the memory budget.
-
-    Raises:
-        MemoryBudgetError: If not even one thread fits.
-    """
+    """Number of decoding threads whose frames fit into the memory budget."""
     need = {
         threads: budget.video_bytes(frame, threads) for threads in range(1, min(16, os.cpu_count() or 1) + 1)
     }

@@ -234,7 +234,12 @@ def map_photos(
     if not ordered:
         return None
     largest = max(ordered, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    return Attempt(mapper, _without_misregistered(largest, database, photos, mapper, seed), len(found))
+    with pycolmap.Database.open(database) as opened:
+        wrong = misregistered(largest, opened)
+    if wrong:
+        again = _mapper_options(mapper, seed)
+        largest = register_again(largest, wrong, database, photos.images, again)
+    return Attempt(mapper, largest, len(found))
 
 
 def _mapper_options(mapper: Mapper, seed: int) -> pycolmap.IncrementalPipelineOptions:
@@ -243,16 +248,6 @@ def _mapper_options(mapper: Mapper, seed: int) -> pycolmap.IncrementalPipelineOp
         options.mapper.init_min_tri_angle = SMALL_ANGLE
         options.mapper.abs_pose_min_num_inliers = MIN_MATCHES
     return options
-
-
-def _without_misregistered(
-    model: pycolmap.Reconstruction, database: Path, photos: PreparedPhotos, mapper: Mapper, seed: int
-) -> pycolmap.Reconstruction:
-    """The model with its mis-registered photos registered again, or removed."""
-    with pycolmap.Database.open(database) as opened:
-        wrong = misregistered(model, opened)
-    options = _mapper_options(mapper, seed)
-    return register_again(model, wrong, database, photos.images, options) if wrong else model
 
 
 def unregistered(names: Iterable[str], attempt: Attempt | None) -> tuple[str, ...]:

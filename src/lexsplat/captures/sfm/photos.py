@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from lexsplat.captures.sfm.feature_budget import check_mapping
-from lexsplat.captures.sfm.preparation import PreparedPhotos, find_photos, photo_folder, prepare_photos
+from lexsplat.captures.sfm.preparation import PreparedPhotos, photo_folder, prepare_photos
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import BackendError, CaptureError
 from lexsplat.runtime.files import atomic_path
@@ -28,7 +28,6 @@ from lexsplat.runtime.progress import Event, FirstUnits, Listener, silent, uncou
 if TYPE_CHECKING:
     from lexsplat.captures.sfm.mapping import Attempt, Mapper
 
-__all__ = ["PhotoPoses", "PoseConfig", "find_photos", "photo_folder", "poses_from_photos"]
 
 STAGE, MATCHING = "poses", "matching"
 EXHAUSTIVE_LIMIT = 80
@@ -147,7 +146,13 @@ def poses_from_photos(
     from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
 
     folder, output, config = photo_folder(Path(folder)), Path(output), config or PoseConfig()
-    _check_mapper(config)
+    if config.mapper == "global" and not mapping.HAS_GLOBAL:
+        raise BackendError(
+            "the global mapper",
+            expected="pycolmap 4 or later",
+            found=mapping.pycolmap.__version__,
+            remedy="pip install --upgrade pycolmap, or use the incremental mapper",
+        )
     photos = prepare_photos(folder, output, memory=memory, listener=listener)
     names, total = photos.names, 2 * len(photos.names) + 1
     work = _work_folder(output, photos, config, seed)
@@ -260,18 +265,6 @@ def _report(listener: Listener, photos: PreparedPhotos, done: int) -> None:
     """Send an event of stage "poses" that is not its last one."""
     total = 2 * len(photos.names) + 1
     listener(Event(STAGE, min(done, total - 1), total))
-
-
-def _check_mapper(config: PoseConfig) -> None:
-    from lexsplat.captures.sfm.mapping import HAS_GLOBAL, pycolmap
-
-    if config.mapper == "global" and not HAS_GLOBAL:
-        raise BackendError(
-            "the global mapper",
-            expected="pycolmap 4 or later",
-            found=pycolmap.__version__,
-            remedy="pip install --upgrade pycolmap, or use the incremental mapper",
-        )
 
 
 def _work_folder(output: Path, photos: PreparedPhotos, config: PoseConfig, seed: int) -> Path:

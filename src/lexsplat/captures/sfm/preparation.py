@@ -22,6 +22,7 @@ from lexsplat.captures.images.masks import IGNORE_FOLDER, find_ignore_masks
 from lexsplat.captures.images.reading import (
     IMAGE_SUFFIXES,
     image_size,
+    misfit,
     open_image,
     read_bytes,
     read_mask,
@@ -211,11 +212,7 @@ def upright_size(path: Path) -> tuple[int, int]:
 
 
 def _look_at(folder: Path, name: str) -> _Photo:
-    """The header of a photo.
-
-    Raises:
-        CaptureError: If it is not an image, or is truncated.
-    """
+    """The header of a photo."""
     path = folder / name
     width, height = image_size(path)
     with open_image(path) as image:
@@ -328,12 +325,7 @@ def _fitted_mask(mask: NDArray[np.bool_], photo: _Photo, subject: Path) -> NDArr
     if not sizes_agree(size, photo.size) and photo.orientation >= 5 and sizes_agree(size[::-1], photo.size):
         mask = turned_upright(mask, photo.orientation)
     elif not sizes_agree(size, photo.size):
-        raise CaptureError(
-            subject,
-            expected=f"a mask of {photo.name}, {photo.size[0]}x{photo.size[1]} pixels or scaled uniformly",
-            found=f"{size[0]}x{size[1]}",
-            remedy="draw the mask on this photo, or remove it",
-        )
+        raise misfit(subject, size, photo.name, photo.size)
     return resize_nearest(mask, photo.size)
 
 

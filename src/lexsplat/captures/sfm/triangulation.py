@@ -8,7 +8,6 @@ of the known poses are dropped, and the rest is triangulated with fixed poses.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -134,16 +133,9 @@ def triangulate(
         return known
     from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
 
-    total = 2 * len(views) + 3
     with tempfile.TemporaryDirectory(prefix="lexsplat-") as temporary, quiet_pycolmap(seed):
-
-        def report(done: int) -> None:
-            listener(Event(STAGE, done, total))
-
-        def report_pairs(done: int, pairs: int) -> None:
-            listener(Event(MATCHING, done, pairs))
-
-        points, colors = _run_pycolmap(views, Path(temporary), seed, memory, report, report_pairs)
+        points, colors = _run_pycolmap(views, Path(temporary), seed, memory, listener)
+    total = 2 * len(views) + 3
     listener(Event(STAGE, total, total, {"points": len(points)}))
     if cached is not None:
         _write_cache(cached, points, colors)
@@ -169,10 +161,7 @@ def random_points_in_frusta(
 
     Raises:
         CaptureError: If an image cannot be read.
-        ValueError: If ``count`` is negative.
     """
-    if count < 0:
-        raise ValueError(f"count must not be negative, got {count}")
     views = capture.train_views
     owners = np.sort(rng.integers(0, len(views), count))
     pixels = rng.random((count, 10, 2))
@@ -275,16 +264,17 @@ def _write_photo(view: View, folder: Path, name: str) -> None:
 
 
 def _run_pycolmap(
-    views: tuple[View, ...],
-    folder: Path,
-    seed: int,
-    memory: int,
-    report: Callable[[int], None],
-    report_pairs: Callable[[int, int], None],
+    views: tuple[View, ...], folder: Path, seed: int, memory: int, listener: Listener
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Extract and match features, verify matches with the known poses, triangulate."""
     from lexsplat.captures.sfm import mapping
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+    def report(done: int) -> None:
+        listener(Event(STAGE, done, 2 * len(views) + 3))
+
+    def report_pairs(done: int, pairs: int) -> None:
+        listener(Event(MATCHING, done, pairs))
 
     names = tuple(_file_name(index) for index in range(len(views)))
     for done, (view, name) in enumerate(zip(views, names)):

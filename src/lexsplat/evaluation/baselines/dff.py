@@ -17,6 +17,7 @@ from lexsplat.evaluation.baselines.feature_rendering import (
     CHANNELS,
     GaussianFeatures,
     TrainingData,
+    TrainingViews,
     back_projected_mean,
     resized_map,
 )
@@ -49,13 +50,13 @@ class Dff:
     def fit(self, data: TrainingData, run: BaselineRun) -> GaussianFeatures:
         """Fit CLIP features to the Gaussians; events are of stage "dff"."""
         config = self.settings
-        maps, views = data.maps, data.views(run.memory, scale=config.scale)
+        maps, views = data.maps, TrainingViews(data, scale=config.scale, memory=run.memory)
         dimensions = maps[views.names[0]].clip.shape[-1]
         ranges = [slice(start, start + CHANNELS) for start in range(0, dimensions, CHANNELS)]
         total = len(views.names) + config.steps * len(ranges)
         features, weights = back_projected_mean(
             views,
-            lambda name, camera: resized_map(maps[name].clip, camera),
+            lambda name: maps[name].clip,
             listener=lambda done: run.listener(Event("dff", done, total)),
         )
         seen = (weights > 0)[:, None]

@@ -48,59 +48,29 @@ class TrainingData:
     gaussians: Gaussians
     cameras: Mapping[str, Camera]
     maps: Mapping[str, FeatureMap]
-    level_maps: LevelMaps | None = None
-
-    def views(self, memory: int = DEFAULT_MEMORY, *, scale: int = 1) -> TrainingViews:
-        """The training views at ``scale`` pixels per cell of their maps; a quarter of ``memory`` for projections."""
-        return TrainingViews(
-            self.gaussians, self.cameras, self._cells, scale=scale, memory=min(MAX_STORE, memory // 4)
-        )
-
-    def levels(self) -> LevelMaps:
-        """Features of each crop size.
-
-        Raises:
-            ValueError: If there are none.
-        """
-        if self.level_maps is None:
-            raise ValueError("this method needs the features of each crop size (level_maps)")
-        return self.level_maps
-
-    def _cells(self, name: str) -> tuple[int, int]:
-        rows, cols = self.maps[name].clip.shape[:2]
-        return cols, rows
+    level_maps: LevelMaps
 
 
 class TrainingViews:
     """Training views at the resolution of their feature maps; projections are kept as far as memory allows.
 
     Args:
-        gaussians: The geometry.
-        cameras: The training views by name.
-        cells: Width and height of the feature maps by view name.
+        data: Geometry, cameras and maps.
         scale: Rendered pixels per cell along a side; never more than the camera has.
-        memory: Bound in bytes for the projections that are kept; results do not depend on it.
+        memory: Memory budget in bytes, a quarter of it for projections; results do not depend on it.
     """
 
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        cameras: Mapping[str, Camera],
-        cells: Callable[[str], tuple[int, int]],
-        *,
-        scale: int = 1,
-        memory: int = MAX_STORE,
-    ) -> None:
-        self.gaussians = gaussians.detach()
-        self.names = sorted(cameras)
-        self._cameras, self._cells, self._scale = cameras, cells, scale
-        self._limit, self._kept = memory, dict[str, PreparedView]()
+    def __init__(self, data: TrainingData, *, scale: int = 1, memory: int = DEFAULT_MEMORY) -> None:
+        self.gaussians = data.gaussians.detach()
+        self.names = sorted(data.cameras)
+        self._cameras, self._maps, self._scale = data.cameras, data.maps, scale
+        self._limit, self._kept = min(MAX_STORE, memory // 4), dict[str, PreparedView]()
 
     def prepared(self, name: str) -> tuple[Camera, PreparedView]:
         """Camera and projection of a view at the rendered size."""
         if name in self._kept:
             return self._kept[name].camera, self._kept[name]
-        full, (cols, rows) = self._cameras[name], self._cells(name)
+        full, (rows, cols) = self._cameras[name], self._maps[name].clip.shape[:2]
         width, height = min(full.width, cols * self._scale), min(full.height, rows * self._scale)
         camera = full.resized(width, height)
         view = prepare(self.gaussians, camera)
@@ -180,7 +150,7 @@ def resized_map(values: Tensor, camera: Camera) -> Tensor:
 
 
 def back_projected_mean(
-    views: TrainingViews, map_of: Callable[[str, Camera], Tensor], *, listener: Callable[[int], None]
+    views: TrainingViews, map_of: Callable[[str], Tensor], *, listener: Callable[[int], None]
 ) -> tuple[Tensor, Tensor]:
     """Mean feature of each Gaussian over all training views, weighted by alpha T.
 
@@ -189,7 +159,7 @@ def back_projected_mean(
 
     Args:
         views: The training views.
-        map_of: The map ``[H, W, C]`` of a view at the size of its camera.
+        map_of: The map ``[h, w, C]`` of a view; it is resampled to the size of the camera.
         listener: Receives the number of finished views.
 
     Returns:
@@ -199,7 +169,8 @@ def back_projected_mean(
     weights = torch.zeros(len(views.gaussians), device=views.gaussians.device)
     for done, name in enumerate(views.names, start=1):
         camera, prepared = views.prepared(name)
-        found = back_project(views.gaussians, camera, map_of(name, camera).to(weights.device), prepared)
+        values = resized_map(map_of(name), camera).to(weights.device)
+        found = back_project(views.gaussians, camera, values, prepared)
         total = found if total is None else total + found
         weights += accumulate_weights(views.gaussians, camera, prepared=prepared)
         listener(done)

@@ -29,7 +29,6 @@ from lexsplat.evaluation.baselines.feature_rendering import (
     back_projected_mean,
     resized_map,
 )
-from lexsplat.geometry.cameras import Camera
 from lexsplat.rendering import render
 from lexsplat.runtime.progress import Event
 
@@ -77,11 +76,10 @@ def _depth(views: TrainingViews, name: str) -> Tensor:
     return depth
 
 
-def _map_at_scale(
-    views: TrainingViews, name: str, camera: Camera, level_maps: LevelMaps, scale: float
-) -> Tensor:
+def _map_at_scale(views: TrainingViews, name: str, level_maps: LevelMaps, scale: float) -> Tensor:
     """The map ``[H, W, D]`` of crops that are ``scale`` wide at the depth of each pixel."""
     levels, sides = level_maps(name)
+    camera, _ = views.prepared(name)
     depth = _depth(views, name)
     wanted = scale * float(camera.K[0, 0]) / depth.clamp_min(1e-6) / camera.width
     weights = level_weights(wanted, sides).to(levels.device)
@@ -149,7 +147,7 @@ class Lerf:
         The DINO part of the features regularizes. The seed has no effect. Events are of stage "lerf".
         """
         config = self.settings
-        maps, level_maps, views = data.maps, data.levels(), data.views(run.memory)
+        maps, level_maps, views = data.maps, data.level_maps, TrainingViews(data, memory=run.memory)
         scales = physical_scales(views, level_maps, config.scales)
         total = (config.scales + 1) * len(views.names)
         found = []
@@ -157,7 +155,7 @@ class Lerf:
             offset = index * len(views.names)
             features, _ = back_projected_mean(
                 views,
-                lambda name, camera, scale=scale: _map_at_scale(views, name, camera, level_maps, scale),  # type: ignore[misc]
+                lambda name, scale=scale: _map_at_scale(views, name, level_maps, scale),  # type: ignore[misc]
                 listener=lambda done, offset=offset: run.listener(Event("lerf", offset + done, total)),  # type: ignore[misc]
             )
             found.append(features)
@@ -167,7 +165,7 @@ class Lerf:
         if config.neighbors and with_dino and len(data.gaussians) > 1:
             dino, _ = back_projected_mean(
                 views,
-                lambda name, camera: resized_map(maps[name].dino, camera),  # type: ignore[arg-type]  # see with_dino
+                lambda name: maps[name].dino,  # type: ignore[arg-type, return-value]  # see with_dino
                 listener=lambda done: run.listener(Event("lerf", total - len(views.names) + done, total)),
             )
             stacked = smooth_by_similarity(data.gaussians.means, dino, stacked, config)

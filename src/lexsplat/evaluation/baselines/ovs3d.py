@@ -78,14 +78,10 @@ class ClassFeatures:
     def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
         """Maps ``[P, H, W]``: each prompt against the best other class; the negatives have no part."""
         (positives,) = unit_texts(question.positives)
-        cosines, alpha = render_cosines(
-            gaussians, camera, self.features, torch.cat([positives, self.classes.to(positives)])
-        )
-        return (
-            (self._against_others(cosines, positives, question.config) * alpha[..., None])
-            .permute(2, 0, 1)
-            .contiguous()
-        )
+        texts = torch.cat([positives, self.classes.to(positives)])
+        cosines, alpha = render_cosines(gaussians, camera, self.features, texts)
+        found = self._against_others(cosines, positives, question.config) * alpha[..., None]
+        return found.permute(2, 0, 1).contiguous()
 
     def gaussian_scores(self, question: Question) -> Tensor | None:
         """Scores ``[P, N]``."""
@@ -147,7 +143,7 @@ class _Fit:
     def __init__(
         self, data: TrainingData, views: TrainingViews, start: Tensor, classes: Tensor, config: Ovs3dConfig
     ) -> None:
-        self.views, self.maps, self.level_maps = views, data.maps, data.levels()
+        self.views, self.maps, self.level_maps = views, data.maps, data.level_maps
         self.classes, self.config = classes, config
         self.features = start.clone().requires_grad_()
         levels = len(self.level_maps(views.names[0])[1])
@@ -206,11 +202,11 @@ class Ovs3d:
             raise ValueError(f"3dovs needs the prompts of the evaluation, at least two classes, got {found}")
         config = self.settings
         (classes,) = unit_texts(run.classes)
-        views = data.views(run.memory)
+        views = TrainingViews(data, memory=run.memory)
         total = len(views.names) + config.steps
         start, weights = back_projected_mean(
             views,
-            lambda name, camera: resized_map(data.maps[name].clip, camera),
+            lambda name: data.maps[name].clip,
             listener=lambda done: run.listener(Event("3dovs", done, total)),
         )
         fit = _Fit(data, views, start, classes.to(start.device), config)

@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 
 from lexsplat.evaluation.report.gallery import Gallery
-from lexsplat.evaluation.report.numbers import mean_and_std, number
 from lexsplat.evaluation.report.tables import (
     OTHER_PROTOCOLS,
     REFERENCE_ROWS,
     Row,
     best_rows,
     heading,
+    mean_and_std,
     prompts_worst_first,
     row_cells,
     table_rows,
 )
-from lexsplat.evaluation.report.templating import write_page
+from lexsplat.evaluation.report.templating import number, write_page
 
 MAX_CASES = 40
 """Cases that are shown with the images of all methods, at most; the page states how many were left out."""
@@ -67,41 +67,38 @@ class MeasuredMethod:
         return {p: mean_and_std([row[p].get(key) for row in rows if p in row]) for p in prompts}
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Content of the page.
+def write_comparison(
+    path: Path,
+    methods: Sequence[MeasuredMethod],
+    title: str,
+    columns: Sequence[str] = (),
+    *,
+    config: Mapping[str, Any],
+    machine: Mapping[str, Any],
+) -> None:
+    """Write the page, whole or not at all.
 
     Args:
+        path: The file.
         methods: The measured methods, in the order of the table.
         title: Heading of the page.
         columns: Keys of the table; empty: the columns of the paper's Table 1 and ours.
         config: Settings, with "seeds".
         machine: What it ran on.
     """
-
-    methods: Sequence[MeasuredMethod]
-    title: str
-    columns: Sequence[str] = ()
-    config: Mapping[str, Any] = field(default_factory=dict)
-    machine: Mapping[str, Any] = field(default_factory=dict)
-
-
-def write_comparison(path: Path, comparison: Comparison) -> None:
-    """Write the page, whole or not at all."""
-    methods = comparison.methods
     rows = table_rows({method.name: method.results for method in methods})
     ranked = _worst_first(methods)
     shown = ranked[:MAX_CASES]
     stages, seconds = _seconds(methods)
     views = _shared_views(methods)
     content = {
-        "title": comparison.title,
+        "title": title,
         "subtitle": "The same Gaussians and the same features, measured on held-out views",
         "cards": _cards(methods, rows),
         "methods": methods,
         "method_names": [method.name for method in methods],
         "colors": {method.name: index % COLORS for index, method in enumerate(methods)},
-        "table": _table(rows, comparison.columns),
+        "table": _table(rows, columns),
         "other_protocols": _table(rows, OTHER_PROTOCOLS),
         "reference_rows": [str(row["name"]) for row in rows if row["name"] in REFERENCE_ROWS],
         "seeds": max((int(row["runs"]) for row in rows), default=1),
@@ -115,14 +112,14 @@ def write_comparison(path: Path, comparison: Comparison) -> None:
         "details": [(method.name, prompts) for method in methods if (prompts := _details(method))],
         "stages": stages,
         "stage_seconds": seconds,
-        "config": comparison.config,
-        "machine": comparison.machine,
+        "config": config,
+        "machine": machine,
         "shown_views": [view for view in views if view in {view for view, _ in shown}],
     }
     write_page(path, "comparison.html", content, views)
 
 
-def _cards(methods: Sequence[MeasuredMethod], rows: Sequence[Row]) -> list[dict[str, str]]:
+def _cards(methods: Sequence[MeasuredMethod], rows: Sequence[Row]) -> list[tuple[str, str, str]]:
     """The best values with the names of their methods, and how much was measured."""
     facts = []
     for key, name in (("mIoU", "best mIoU"), ("mAP", "best mAP"), ("mIoU_oracle", "best oracle mIoU")):
@@ -134,22 +131,17 @@ def _cards(methods: Sequence[MeasuredMethod], rows: Sequence[Row]) -> list[dict[
     views = {view for method in methods for view in method.cases}
     if prompts:
         facts += [("prompts", str(len(prompts)), ""), ("held-out views", str(len(views)), "")]
-    return [dict(zip(("name", "value", "note"), fact)) for fact in facts]
+    return facts
 
 
 def _table(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, Any]:
     """Headings and rows of cells; the best value of a column is marked."""
     shown, texts = row_cells(rows, keys)
-    best = {key: best_rows(rows, key) for key in shown}
+    best = [best_rows(rows, key) for key in shown]
+    cells = [[(text, i in marked) for text, marked in zip(line, best)] for i, line in enumerate(texts)]
     return {
         "headings": [heading(key) for key in shown],
-        "rows": [
-            {
-                "name": str(row["name"]),
-                "cells": [{"text": text, "best": index in best[key]} for key, text in zip(shown, line)],
-            }
-            for index, (row, line) in enumerate(zip(rows, texts))
-        ],
+        "rows": list(zip([row["name"] for row in rows], cells)),
     }
 
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from lexsplat.evaluation.report.gallery import Gallery
-from lexsplat.evaluation.report.numbers import number
 from lexsplat.evaluation.report.tables import prompts_worst_first, protocol_rows
-from lexsplat.evaluation.report.templating import write_page
+from lexsplat.evaluation.report.templating import number, write_page
 from lexsplat.evaluation.results import Metrics
 from lexsplat.queries.heatmaps import color_scale
 
@@ -64,7 +63,7 @@ def _worst_first(metrics: Metrics, gallery: Gallery) -> list[_Case]:
     return sorted(cases, key=lambda case: (case.iou, case.view, case.prompt))
 
 
-def _cards(data: dict[str, Any]) -> list[dict[str, str]]:
+def _cards(data: dict[str, Any]) -> list[tuple[str, str, str]]:
     """The headline numbers."""
     quality = data["quality"]
     facts = [("PSNR", number(quality["psnr"], 2), "dB"), ("SSIM", number(quality["ssim"]), "")]
@@ -75,7 +74,7 @@ def _cards(data: dict[str, Any]) -> list[dict[str, str]]:
             ("mAP", number(strict["mAP"]), ""),
             ("localization", number(strict["localization"]), ""),
         ]
-    return [dict(zip(("name", "value", "note"), fact)) for fact in facts]
+    return facts
 
 
 def _hero(cases: Sequence[_Case], gallery: Gallery) -> dict[str, Any] | None:

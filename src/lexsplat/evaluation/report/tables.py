@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lexsplat.evaluation.report.numbers import known_values, mean_and_std, number, size_text
-from lexsplat.evaluation.report.templating import latex_table, write_text
+import numpy as np
+
+from lexsplat.evaluation.report.templating import latex_table, number, size_text, write_text
 
 COLUMNS = ("mIoU", "mPA", "mP", "mAP")
 
@@ -163,6 +165,20 @@ def _numbers(result: Mapping[str, Any]) -> dict[str, float | None]:
         "training_seconds": sum(seconds.values()) if seconds else None,
         "language_seconds": sum(language_stages) if language_stages else None,
     }
+
+
+def known_values(values: Any) -> list[float]:
+    """The finite numbers of one value or a list of values."""
+    listed = values if isinstance(values, (list, tuple)) else [values]
+    return [float(value) for value in listed if value is not None and math.isfinite(value)]
+
+
+def mean_and_std(values: Any) -> tuple[float | None, float | None]:
+    """Mean and sample standard deviation of the finite values; None where there are too few."""
+    known = known_values(values)
+    if not known:
+        return None, None
+    return float(np.mean(known)), float(np.std(known, ddof=1)) if len(known) > 1 else None
 
 
 def row_cells(rows: Sequence[Row], keys: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:

@@ -19,7 +19,6 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from numpy.typing import NDArray
 from PIL import Image
 
-from lexsplat.evaluation.report.numbers import number, size_text
 from lexsplat.runtime.files import atomic_path
 
 
@@ -29,24 +28,18 @@ def write_page(path: Path, template: str, content: Mapping[str, Any], views: Map
     Args:
         path: The file.
         template: File name in ``templates/``.
-        content: Variables of the template, with "title", "subtitle", "cards" (dictionaries of "name", "value" and
-            "note"), "shown_views" (names of ``views`` whose images the page contains), "config" and "machine".
+        content: Variables of the template, with "title", "subtitle", "cards" (names, values and notes), "shown_views"
+            (names of ``views`` whose images the page contains), "config" and "machine".
         views: ``{view: {"photo" | "render": JPEG}}``.
     """
-    rendered = (
-        environment()
-        .get_template(template)
-        .render(
-            {
-                **content,
-                "views": views,
-                "view_index": {view: index for index, view in enumerate(views)},
-                "provenance": _provenance(content["config"], content["machine"]),
-                "documents": {name: content[name] for name in ("machine", "config")},
-            }
-        )
-    )
-    write_text(path, rendered)
+    variables = {
+        **content,
+        "views": views,
+        "view_index": {view: index for index, view in enumerate(views)},
+        "provenance": _provenance(content["config"], content["machine"]),
+        "documents": {name: content[name] for name in ("machine", "config")},
+    }
+    write_text(path, environment().get_template(template).render(variables))
 
 
 def write_text(path: Path, text: str) -> None:
@@ -87,6 +80,23 @@ def environment() -> Environment:
     }
     found.globals["parts"] = found.get_template("parts.html").module
     return found
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number with a fixed number of decimals; "-" for None and NaN."""
+    return "-" if value is None or value != value else f"{value:.{digits}f}"
+
+
+def size_text(count: int | None) -> str:
+    """A number of bytes in the largest fitting unit (powers of 1000)."""
+    if count is None:
+        return "-"
+    value, unit = float(count), "B"
+    for larger in ("KB", "MB", "GB"):
+        if value < 1000:
+            break
+        value, unit = value / 1000, larger
+    return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
 
 
 def curve_points(curve: Sequence[float] | NDArray[np.float64]) -> str:
