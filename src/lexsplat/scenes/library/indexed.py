@@ -11,6 +11,7 @@ import contextlib
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -72,53 +73,26 @@ class Indexed:
 
 
 class _KeptPresence(PresenceClassifier):
-    """`PresenceClassifier` with the places that were found when the scene was added."""
+    """`PresenceClassifier` with what was kept when the scene was added."""
 
     def __init__(self, contents: Contents, codes: Tensor) -> None:
-        self._contents = contents
+        self._contents, self._best_colored = contents, contents.best_colored
         scale = EverydayScale(contents.mean, contents.best, float(contents.peak))
-        kept = _KeptField(contents, codes)
-        super().__init__(_one_gaussian(), kept, scale, self._none)  # type: ignore[arg-type]
+        field: Any = SimpleNamespace(
+            codebook=SimpleNamespace(clip=codes.float()), segments=_segments(contents)
+        )
+        places = DescribedPlaces(contents.places.float(), ())
+        super().__init__(_one_gaussian(), field, scale, self._no_text, places)
 
     @staticmethod
-    def _none(_: Any) -> Tensor:
+    def _no_text(_: Any) -> Tensor:
         raise ValueError("the places of the scene are kept")
 
-    @property
-    def segment_codes(self) -> SegmentCodes | None:  # type: ignore[override]
-        return _KeptCodes(self._contents)  # type: ignore[return-value]
-
-    @property
-    def places(self) -> DescribedPlaces:  # type: ignore[override]
-        return DescribedPlaces(self._contents.places.float(), ())
-
-    @property
-    def _best_colored(self) -> Tensor:  # type: ignore[override]
-        return self._contents.best_colored
-
-
-class _KeptCodes:
-    """The language of the segments of all levels, made where a phrase names a part of a thing."""
-
-    def __init__(self, contents: Contents) -> None:
-        self._contents = contents
-
-    @property
-    def distributions(self) -> Tensor:
+    @functools.cached_property
+    def segment_codes(self) -> SegmentCodes | None:
+        """The language of the segments of all levels; made where a phrase names a part of a thing."""
         spread = torch.from_numpy(_spread(self._contents).toarray())
-        return segment_codes(_segments(self._contents), lambda index: spread[index]).distributions
-
-
-class _KeptCodebook:
-    def __init__(self, clip: Tensor) -> None:
-        self.clip, self.num_codes = clip, len(clip)
-
-
-class _KeptField:
-    """The language of the segments, as far as presence reads it."""
-
-    def __init__(self, contents: Contents, codes: Tensor) -> None:
-        self.codebook, self.segments = _KeptCodebook(codes.float()), _segments(contents)
+        return segment_codes(_segments(self._contents), lambda index: spread[index])
 
 
 @functools.cache
