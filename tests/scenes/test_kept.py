@@ -12,7 +12,7 @@ from lexsplat.geometry.world import World
 from lexsplat.queries.phrases import Thing, Understood
 from lexsplat.queries.relevancy import QueryConfig
 from lexsplat.rendering import render
-from lexsplat.scenes import kept_objects
+from lexsplat.scenes import kept as kept_files
 from lexsplat.scenes.answers import answer_queries, find_phrase
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.folder import BUNDLED_SCENE
@@ -155,10 +155,10 @@ def test_the_key_of_a_scene_depends_on_everything_that_its_views_show(demo_copy)
         lambda scene, _: setattr(scene, "query", QueryConfig(templates=("a photo of {}",))),
         lambda scene, _: setattr(scene, "world", World(Up(np.array([0.0, 1.0, 0.0]), True))),
         lambda scene, _: scene.folder.record["stages"]["features"].update(clip_hash="another"),
-        lambda _, patch: patch.setattr(kept_objects, "everyday_words", lambda: ["one", "two"]),
-        lambda _, patch: patch.setattr(kept_objects, "default_vocabulary", lambda clip: ["one"]),
-        lambda _, patch: patch.setattr(kept_objects, "STUFF", {"one"}),
-        lambda _, patch: patch.setattr(kept_objects, "_VERSION", -1),
+        lambda _, patch: patch.setattr(kept_files, "everyday_words", lambda: ["one", "two"]),
+        lambda _, patch: patch.setattr(kept_files, "default_vocabulary", lambda clip: ["one"]),
+        lambda _, patch: patch.setattr(kept_files, "STUFF", {"one"}),
+        lambda _, patch: patch.setattr(kept_files, "_OBJECTS_VERSION", -1),
     ],
     ids=[
         "codes",

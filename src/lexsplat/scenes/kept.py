@@ -1,27 +1,35 @@
-"""What a scene keeps on disk so that its first question is fast: what its views show, and the words it compares with.
+"""What a scene keeps on disk so that its first questions are fast: what its views show, its words, and its objects.
 
-``checkpoints/seen.safetensors`` is written whole or not at all, after a build and for a saved edit. It names the
-Gaussians, segments and cameras that it was computed from. A file of others, or a damaged one, counts as none: what it
-holds is then computed when it is asked for. The objects of the scene are beside it (`kept_objects`).
+``checkpoints/seen.safetensors`` names the Gaussians, segments and cameras that it was computed from, and
+``checkpoints/objects.safetensors`` also the encoder, vocabularies and query. Both are written whole or not at all,
+after a build and for a saved edit. A file of another scene, or a damaged one, counts as none: what it holds is then
+computed when it is asked for. Dimension letters: N Gaussians, O objects, V places, K codes.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from lexsplat.geometry.boxes import Box
 from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.presence import DescribedPlaces
 from lexsplat.queries.seen import MOST_VIEWS, Seen
+from lexsplat.queries.selection import Selection
+from lexsplat.queries.vocabulary import STUFF, default_vocabulary
 from lexsplat.runtime.errors import FileFormatError, LexsplatError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import digest
 from lexsplat.runtime.progress import Listener
 from lexsplat.scenes.folder import SceneFolder
-from lexsplat.scenes.kept_objects import FILE, KeptObjects, read_objects, write_objects
 
 if TYPE_CHECKING:
     from lexsplat.features.text import TextTower
@@ -29,8 +37,21 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("lexsplat")
 
-_VERSION = 1
-"""Raised when the content is computed in another way."""
+_SEEN_VERSION, _OBJECTS_VERSION = 1, 3
+"""Raised when the content of a file is computed in another way."""
+
+
+@dataclass(frozen=True)
+class KeptObjects:
+    """The objects of a scene, and the places of its phrases.
+
+    Args:
+        objects: The objects, as `lexsplat.scenes.objects.objects_of` finds them.
+        places: Where presence is decided (`lexsplat.queries.presence`).
+    """
+
+    objects: tuple[Selection, ...]
+    places: DescribedPlaces
 
 
 def seen_of(scene: Scene) -> Seen | None:
@@ -40,7 +61,7 @@ def seen_of(scene: Scene) -> Seen | None:
         return None
     training = [name for name, view in scene.views.items() if view.split == "train"]
     cameras, kept, key = scene.cameras, None, ""
-    path = _path(scene)
+    path = _path(scene, "seen")
     if path is not None and path.exists():
         key = scene_key(scene)
         try:
@@ -60,7 +81,7 @@ def keep(scene: Scene) -> None:
     Args:
         scene: As its folder has it; reports stages "words" and "views".
     """
-    path = _path(scene)
+    path = _path(scene, "seen")
     if path is None:
         return
     try:
@@ -73,7 +94,9 @@ def keep(scene: Scene) -> None:
         classifier = scene.presence_classifier
         scene.embed(classifier.colored or ["object"])
         if scene.kept is None and scene.field.segments is not None:
-            write_objects(scene, KeptObjects(scene.objects, classifier.places), path.with_name(FILE))
+            _write_objects(
+                scene, KeptObjects(scene.objects, classifier.places), path.with_name("objects.safetensors")
+            )
     except (OSError, LexsplatError) as error:
         # Nothing is lost: questions compute it, and report a missing encoder.
         log.debug("%s: not kept (%s)", path, str(error)[:200])
@@ -97,23 +120,99 @@ def keep_for(
     keep(scene)
 
 
-def _path(scene: Scene) -> Path | None:
-    return None if scene.folder is None else scene.folder.root / "checkpoints" / "seen.safetensors"
+def _path(scene: Scene, name: str) -> Path | None:
+    return None if scene.folder is None else scene.folder.root / "checkpoints" / f"{name}.safetensors"
 
 
 def kept_objects_of(scene: Scene) -> KeptObjects | None:
-    """The objects of a scene, where its folder keeps them."""
-    path = _path(scene)
-    return None if path is None else read_objects(scene, path.with_name(FILE))
+    """The objects of a scene from its folder; None where it keeps none that fit the scene."""
+    path = _path(scene, "objects")
+    if path is None or not path.exists() or scene.field.segments is None:
+        return None
+    try:
+        tensors, facts = read_tensors(path)
+        if facts.get("of") != digest(_object_parts(scene)):
+            return None
+        places = DescribedPlaces(tensors["places"], tuple(json.loads(facts["words"])))
+        return KeptObjects(_selections(scene, tensors, json.loads(facts["objects"])), places)
+    except (FileFormatError, KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
+        log.warning("%s: computed again (%s)", path, str(error)[:100])
+        return None
+
+
+def _write_objects(scene: Scene, kept: KeptObjects, path: Path) -> None:
+    """Write the objects of a scene with segments."""
+    numbers = torch.full((len(scene.gaussians),), -1, dtype=torch.int32)
+    for number, each in enumerate(kept.objects):
+        numbers[each.indices.cpu()] = number
+    boxes = [np.concatenate([part.ravel() for part in each.box]) for each in kept.objects]
+    tensors = {
+        "numbers": numbers.short() if len(kept.objects) < 1 << 15 else numbers,
+        "boxes": torch.from_numpy(np.array(boxes).reshape(-1, 15)),
+        "strengths": torch.stack([each.scores[each.indices[0]].cpu() for each in kept.objects])
+        if kept.objects
+        else torch.zeros(0),
+        "places": kept.places.distributions.cpu().contiguous(),
+    }
+    facts = {
+        "of": digest(_object_parts(scene)),
+        "objects": json.dumps([[each.phrase, each.names] for each in kept.objects]),
+        "words": json.dumps(kept.places.words),
+    }
+    write_tensors(path, tensors, facts)
+
+
+def _selections(scene: Scene, tensors: dict[str, Tensor], entries: list) -> tuple[Selection, ...]:
+    numbers, device = tensors["numbers"].long(), scene.gaussians.device
+    if numbers.shape != (len(scene.gaussians),) or tensors["boxes"].shape != (len(entries), 15):
+        raise ValueError("it does not fit the scene")
+    strengths = torch.cat([tensors["strengths"], torch.zeros(1)])  # the last one is that of no object
+    whole = Selection(
+        scene.gaussians,
+        scene.cameras,
+        (numbers >= 0).to(device),
+        strengths[numbers].to(device),
+        world=scene.world,
+        seen=scene.seen,
+    )
+    members = numbers.sort(stable=True).indices.to(device)
+    sizes = torch.bincount(numbers + 1, minlength=len(entries) + 1).tolist()
+    found = []
+    for (phrase, names), box, indices in zip(
+        entries, tensors["boxes"].numpy(), members.split(sizes)[1:], strict=True
+    ):
+        known = tuple((str(name), float(share)) for name, share in names)
+        found.append(
+            whole.part(indices).described(
+                phrase=str(phrase), names=known, box=Box(box[:3], box[3:12].reshape(3, 3), box[12:])
+            )
+        )
+    return tuple(found)
+
+
+def _object_parts(scene: Scene) -> Iterator[bytes]:
+    """Everything that the file of objects depends on."""
+    yield f"{_OBJECTS_VERSION}".encode()
+    yield ((scene.seen.key if scene.seen else "") or scene_key(scene)).encode()
+    for tensor in scene.field.content():
+        yield np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes()
+    encoder = scene.encoder_identity()
+    words = (
+        everyday_words(),
+        default_vocabulary(scene.clip),
+        sorted(STUFF),
+        encoder.get("encoder_hash", encoder["encoder"]),
+    )
+    yield repr((words, scene.query, scene.world.up.direction.tolist())).encode()
 
 
 def scene_key(scene: Scene) -> str:
     """Hash of the Gaussians, segments and cameras of a scene."""
-    return digest(_parts(scene))
+    return digest(_scene_parts(scene))
 
 
-def _parts(scene: Scene) -> Iterator[bytes]:
-    yield f"{_VERSION} {scene.gaussians.antialiased}".encode()
+def _scene_parts(scene: Scene) -> Iterator[bytes]:
+    yield f"{_SEEN_VERSION} {scene.gaussians.antialiased}".encode()
     gaussians, segments = scene.gaussians, scene.field.segments
     tensors = [gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits]
     for tensor in [*tensors, *([segments.labels, segments.masses, segments.levels] if segments else [])]:

@@ -49,8 +49,7 @@ from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.answers import Answers, Word, automatic_thresholds, of_kind, of_part
 from lexsplat.scenes.finding import find_in, understood_in
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder, StoredView
-from lexsplat.scenes.kept import kept_objects_of, seen_of
-from lexsplat.scenes.kept_objects import KeptObjects
+from lexsplat.scenes.kept import KeptObjects, kept_objects_of, seen_of
 from lexsplat.scenes.objects import objects_of
 from lexsplat.scenes.reading import read_scene
 
