@@ -24,7 +24,7 @@ from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import BackendError, FileFormatError
-from lexsplat.scenes.formats.foreign import AGAIN, Damage, read_content, reason, warn
+from lexsplat.scenes.formats.foreign import Damage, damaged, read_content, reason, warn
 from lexsplat.scenes.formats.ply import MIP, is_antialiased, parse_ply, write_ply
 from lexsplat.scenes.formats.ply_elements import (
     byte_order,
@@ -99,11 +99,9 @@ def read_compressed(path: Path, kind: str) -> Gaussians:
         try:
             found = parse_ply(plain)
         except FileFormatError as error:  # its text concerns the temporary file, not the user's
-            raise FileFormatError(
-                path, expected=f"a {kind} file", found="damaged content", remedy=AGAIN
-            ) from error
+            raise damaged(path, f"a {kind} file", "damaged content") from error
     if len(found) != count:
-        raise FileFormatError(path, expected=f"{count:,} Gaussians", found=f"{len(found):,}", remedy=AGAIN)
+        raise damaged(path, f"{count:,} Gaussians", f"{len(found):,}")
     if kind == "ksplat":
         values = found.shN.transpose(1, 2).flatten(1)
         found = replace(found, shN=values[:, _places_in_ksplat(found.sh_degree)].reshape_as(found.shN))
@@ -121,12 +119,7 @@ def _chunked_count(lines: list[str], content: bytes, path: Path) -> int:
     fits = counts.get("chunk") == math.ceil(count / _CHUNK) and counts.get("sh", count) == count
     if left or not fits:
         more = f"{left:,} bytes after them" if left > 0 else "fewer bytes" if left else f"elements {counts}"
-        raise FileFormatError(
-            path,
-            expected=f"{count:,} Gaussians in chunks of {_CHUNK}",
-            found=more.translate(_BARE),
-            remedy=AGAIN,
-        )
+        raise damaged(path, f"{count:,} Gaussians in chunks of {_CHUNK}", more.translate(_BARE))
     others = [element for element in elements if element.name not in ("chunk", "vertex", "sh")]
     warn_of_ignored(others, count, path)
     return count
@@ -154,7 +147,7 @@ def _sectioned_count(content: bytes, path: Path) -> int:
         if held != count:
             raise Damage(f"a count of {count:,}, and {held:,} Gaussians in sections")
     except (struct.error, Damage) as error:
-        raise FileFormatError(path, expected="a ksplat file", found=reason(error), remedy=AGAIN) from error
+        raise damaged(path, "a ksplat file", reason(error)) from error
     if place < len(content):
         warn("%s: %d bytes after the last Gaussian are ignored", path, len(content) - place)
     return int(count)
@@ -203,9 +196,8 @@ def _convert(source: Path, kind: str, target: Path, wanted: str, subject: Path) 
     run = subprocess.run(command, capture_output=True, text=True, errors="replace")
     if run.returncode:
         last = (run.stderr.strip().splitlines() or [""])[-1][:200]
-        raise FileFormatError(
+        raise damaged(
             subject,
-            expected=f"a {kind if wanted == 'ply' else wanted} file",
-            found=last if "failed" in last else "damaged content",
-            remedy=AGAIN,
+            f"a {kind if wanted == 'ply' else wanted} file",
+            last if "failed" in last else "damaged content",
         )

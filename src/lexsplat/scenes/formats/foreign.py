@@ -33,8 +33,8 @@ MOST_DROPPED = 0.1
 AROUND = 5
 """Cameras around a scene are at most this many times as far from its middle as the farthest Gaussian."""
 
-AGAIN = "copy the file again or export it again"
-"""The remedy for damage."""
+AGAIN, EXPORT_AGAIN = "copy the file again or export it again", "export the file again"
+"""The remedies for damage, and for content that copying cannot have changed."""
 
 _logged: ContextVar[set[str] | None] = ContextVar("logged", default=None)
 _LARGEST_LOGIT = 20.0
@@ -44,6 +44,11 @@ _SMALLEST_LOG_SCALE = math.log(1e-12)
 _SMALLEST_QUAT = 1e-18  # squares of smaller ones are 0 in float32
 _ALWAYS_ALLOWED = 10_000
 _MOST_PER_BYTE = 8
+
+
+def damaged(path: Path, expected: str, found: str, remedy: str = AGAIN) -> FileFormatError:
+    """The error of a file with other content than expected."""
+    return FileFormatError(path, expected=expected, found=found, remedy=remedy)
 
 
 class Damage(ValueError):
@@ -111,7 +116,7 @@ def renderable(gaussians: Gaussians, path: Path) -> Gaussians:
     count = int((~valid).sum())
     if count > MOST_DROPPED * len(gaussians):
         found = f"{count:,} of {len(gaussians):,} Gaussians that cannot be rendered: {damage}"
-        raise FileFormatError(path, expected="finite numbers", found=found, remedy="export the file again")
+        raise damaged(path, "finite numbers", found, EXPORT_AGAIN)
     warn("%s: %d of %d Gaussians dropped: %s", path, count, len(gaussians), damage)
     return gaussians.select(valid)
 
@@ -164,11 +169,11 @@ def _check_sizes(gaussians: Gaussians, path: Path) -> None:
     zeros = (gaussians.log_scales < _SMALLEST_LOG_SCALE - 0.01).sum(1)  # 1e-12 itself may be rounded
     count, thin = int((zeros > 0).sum()), int((zeros > 1).sum())
     if thin > len(gaussians) / 2:
-        raise FileFormatError(
+        raise damaged(
             path,
-            expected="Gaussians with sizes",
-            found=f"{thin:,} of {len(gaussians):,} Gaussians with two or three sizes of 0",
-            remedy="export the file again",
+            "Gaussians with sizes",
+            f"{thin:,} of {len(gaussians):,} Gaussians with two or three sizes of 0",
+            EXPORT_AGAIN,
         )
     if count:
         warn("%s: %d of %d Gaussians have a size of 0, read as 1e-12", path, count, len(gaussians))
@@ -192,12 +197,7 @@ def check_count(path: Path, count: int, size: int) -> None:
         FileFormatError: If there are more than 8 Gaussians for each byte; few Gaussians are always allowed.
     """
     if count > max(_ALWAYS_ALLOWED, _MOST_PER_BYTE * size):
-        raise FileFormatError(
-            path,
-            expected=f"Gaussians that fit into {size:,} bytes",
-            found=f"a count of {count:,}",
-            remedy=AGAIN,
-        )
+        raise damaged(path, f"Gaussians that fit into {size:,} bytes", f"a count of {count:,}")
 
 
 def logits_of_bytes(opacities: NDArray[np.uint8]) -> Tensor:
@@ -216,21 +216,24 @@ def as_tensor(values: NDArray) -> Tensor:
     return torch.from_numpy(array)
 
 
-def read_content(path: Path, kind: str) -> bytes:
-    """The bytes of a file.
+@contextlib.contextmanager
+def reading(path: Path, kind: str) -> Iterator[None]:
+    """Errors of the system in this block as errors of the file.
 
     Raises:
         FileFormatError: If it cannot be read.
     """
     try:
-        return path.read_bytes()
+        yield
     except OSError as error:
-        raise FileFormatError(
-            path,
-            expected=f"a readable {kind} file",
-            found=str(error.strerror),
-            remedy="check the path and its permissions",
-        ) from error
+        remedy = "check the path and its permissions"
+        raise damaged(path, f"a readable {kind} file", str(error.strerror), remedy) from error
+
+
+def read_content(path: Path, kind: str) -> bytes:
+    """The bytes of a file; raises as `reading`."""
+    with reading(path, kind):
+        return path.read_bytes()
 
 
 def rounded_centers(places: NDArray[np.float64], log_scales: Tensor, path: Path) -> Tensor:

@@ -25,9 +25,9 @@ from scipy.spatial.transform import Rotation
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.foreign import (
-    AGAIN,
     Damage,
     as_tensor,
+    damaged,
     joined,
     read_content,
     reason,
@@ -73,9 +73,7 @@ def read_gltf(path: Path) -> Gaussians:
     except FileFormatError:
         raise
     except _DAMAGE as error:
-        raise FileFormatError(
-            path, expected=f"glTF with {EXTENSION}", found=reason(error), remedy=AGAIN
-        ) from error
+        raise damaged(path, f"glTF with {EXTENSION}", reason(error)) from error
     if not parts:
         raise FileFormatError(
             path,

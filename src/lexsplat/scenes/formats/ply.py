@@ -17,7 +17,7 @@ import torch
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import as_tensor, rounded_centers, warn
+from lexsplat.scenes.formats.foreign import EXPORT_AGAIN, as_tensor, damaged, reading, rounded_centers, warn
 from lexsplat.scenes.formats.ply_elements import (
     SPLATS,
     Element,
@@ -103,7 +103,7 @@ def read_ply(path: Path) -> Gaussians:
     gaussians = parse_ply(path)
     damage = gaussians.find_invalid()
     if damage:
-        raise FileFormatError(path, expected="finite numbers", found=damage, remedy="export the file again")
+        raise damaged(path, "finite numbers", damage, EXPORT_AGAIN)
     return gaussians
 
 
@@ -113,31 +113,23 @@ def parse_ply(path: Path) -> Gaussians:
     Raises:
         FileFormatError: If the file is not a PLY of 3D Gaussians, is truncated, or has more data than it declares.
     """
-    try:
-        with open(path, "rb") as file:
-            lines = header_lines(file, path)
-            order, elements = byte_order(lines, path), parse_elements(lines, path)
-            vertices = _vertices(elements, path)
-            available = os.path.getsize(path) - file.tell()
-            least = vertices.count * vertices.row_size(order) * (1 if order else 2)  # a digit and a space
-            if available < least:
-                raise FileFormatError(
-                    path,
-                    expected=f"{vertices.count} Gaussians in {least} bytes",
-                    found=f"{available} bytes of data",
-                    remedy="the file is truncated: copy it again or export it again",
-                )
-            table, left = (_binary_rows if order else _text_rows)(file, elements, order, path)
-            _check_left(left, vertices, order, path)
-            warn_of_ignored(elements[1:], vertices.count, path)
-            return _gaussians_from_table(table, is_antialiased(lines), path)
-    except OSError as error:
-        raise FileFormatError(
-            path,
-            expected="a readable PLY file",
-            found=str(error.strerror),
-            remedy="check the path and its permissions",
-        ) from error
+    with reading(path, "PLY"), open(path, "rb") as file:
+        lines = header_lines(file, path)
+        order, elements = byte_order(lines, path), parse_elements(lines, path)
+        vertices = _vertices(elements, path)
+        available = os.path.getsize(path) - file.tell()
+        least = vertices.count * vertices.row_size(order) * (1 if order else 2)  # a digit and a space
+        if available < least:
+            raise damaged(
+                path,
+                f"{vertices.count} Gaussians in {least} bytes",
+                f"{available} bytes of data",
+                "the file is truncated: copy it again or export it again",
+            )
+        table, left = (_binary_rows if order else _text_rows)(file, elements, order, path)
+        _check_left(left, vertices, order, path)
+        warn_of_ignored(elements[1:], vertices.count, path)
+        return _gaussians_from_table(table, is_antialiased(lines), path)
 
 
 def _check_left(left: int, vertices: Element, order: str, path: Path) -> None:
@@ -248,9 +240,7 @@ def _gaussians_from_table(table: np.ndarray, antialiased: bool, path: Path) -> G
     complete = all(f"f_rest_{i}" in (table.dtype.names or ()) for i in range(num_rest))
     if num_rest not in (0, 9, 24, 45, 72) or not complete:
         found = str(num_rest) if complete else "gaps in their numbering"
-        raise FileFormatError(
-            path, expected="0, 9, 24, 45 or 72 f_rest properties", found=found, remedy="export the file again"
-        )
+        raise damaged(path, "0, 9, 24, 45 or 72 f_rest properties", found, EXPORT_AGAIN)
     rest = columns(*(f"f_rest_{i}" for i in range(num_rest))) if num_rest else torch.zeros(len(table), 0)
     log_scales = columns("scale_0", "scale_1", "scale_2")
     places = np.stack([table[name] for name in "xyz"], axis=1)

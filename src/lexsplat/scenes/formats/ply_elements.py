@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import AGAIN, warn
+from lexsplat.scenes.formats.foreign import EXPORT_AGAIN, damaged, warn
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
@@ -84,7 +84,7 @@ def header_lines(file: BinaryIO, path: Path) -> list[str]:
             raise FileFormatError(path, expected=expected, found=found, remedy="shorten its comments")
         if not raw.endswith(b"\n"):
             found = "a file that ends in its header"
-            raise FileFormatError(path, expected="a PLY header up to end_header", found=found, remedy=AGAIN)
+            raise damaged(path, "a PLY header up to end_header", found)
         lines.append(raw.decode("ascii", "replace").strip())
     return lines
 
@@ -92,14 +92,9 @@ def header_lines(file: BinaryIO, path: Path) -> list[str]:
 def _no_ply(first: bytes, path: Path) -> FileFormatError:
     """What is wrong with a file whose first line is not that of a PLY."""
     if not first:
-        return FileFormatError(path, expected="a PLY header", found="an empty file", remedy=AGAIN)
+        return damaged(path, "a PLY header", "an empty file")
     if first.startswith(b"ply\r"):
-        return FileFormatError(
-            path,
-            expected="a PLY header with line feeds",
-            found="carriage returns alone",
-            remedy="export the file again",
-        )
+        return damaged(path, "a PLY header with line feeds", "carriage returns alone", EXPORT_AGAIN)
     return FileFormatError(path, expected="a PLY header", found=repr(first[:20])[1:], remedy=SPLATS)
 
 
@@ -112,9 +107,7 @@ def byte_order(lines: Sequence[str], path: Path) -> str:
     order = next((ENCODINGS[line] for line in lines if line in ENCODINGS), None)
     if order is None:
         found = next((line for line in lines if line.startswith("format")), "no format line")
-        raise FileFormatError(
-            path, expected=" or ".join(ENCODINGS), found=found[:80], remedy="export the file again"
-        )
+        raise damaged(path, " or ".join(ENCODINGS), found[:80], EXPORT_AGAIN)
     return order
 
 
@@ -130,12 +123,7 @@ def parse_elements(lines: Sequence[str], path: Path) -> list[Element]:
         words = line.split()
         if words[:1] == ["element"]:
             if len(words) != 3 or not words[2].isdecimal():
-                raise FileFormatError(
-                    path,
-                    expected="'element NAME COUNT'",
-                    found=repr(line[:80]),
-                    remedy="export the file again",
-                )
+                raise damaged(path, "'element NAME COUNT'", repr(line[:80]), EXPORT_AGAIN)
             if words[1] in [element.name for element in elements]:
                 raise FileFormatError(
                     path,
@@ -147,12 +135,7 @@ def parse_elements(lines: Sequence[str], path: Path) -> list[Element]:
         elif words[:1] == ["property"]:
             column = _column(words)
             if column is None or not elements:
-                raise FileFormatError(
-                    path,
-                    expected="a property of an element",
-                    found=repr(line[:80]),
-                    remedy="export the file again",
-                )
+                raise damaged(path, "a property of an element", repr(line[:80]), EXPORT_AGAIN)
             last = elements[-1]
             elements[-1] = Element(last.name, last.count, (*last.columns, column))
     return elements

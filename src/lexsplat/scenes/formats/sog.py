@@ -27,10 +27,10 @@ from PIL import Image
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.foreign import (
-    AGAIN,
     Damage,
     as_tensor,
     check_count,
+    damaged,
     logits_of_bytes,
     read_content,
     reason,
@@ -72,13 +72,9 @@ def read_sog(path: Path) -> Gaussians:
         with zipfile.ZipFile(io.BytesIO(read_content(path, ".sog"))) as archive:
             return _read(path, lambda name, limit: _in_archive(archive, name, limit), path.stat().st_size)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        raise FileFormatError(
-            path, expected="a SOG archive", found="no whole zip archive", remedy=AGAIN
-        ) from error
+        raise damaged(path, "a SOG archive", "no whole zip archive") from error
     except (KeyError, TypeError, IndexError, ValueError, AttributeError, OverflowError, OSError) as error:
-        raise FileFormatError(
-            path, expected="a SOG of version 1 or 2", found=reason(error), remedy=AGAIN
-        ) from error
+        raise damaged(path, "a SOG of version 1 or 2", reason(error)) from error
 
 
 def _total_size(path: Path) -> int:

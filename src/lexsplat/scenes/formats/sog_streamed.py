@@ -14,7 +14,7 @@ import torch
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import AGAIN, Damage, joined, read_content, reason, warn
+from lexsplat.scenes.formats.foreign import Damage, damaged, joined, read_content, reason, warn
 from lexsplat.scenes.formats.sog import read_sog
 
 LOD_META = "lod-meta.json"
@@ -49,9 +49,7 @@ def read_streamed_sog(path: Path) -> Gaussians:
         OSError,
         RecursionError,
     ) as error:
-        raise FileFormatError(
-            path, expected="a streamed SOG of version 1", found=reason(error), remedy=AGAIN
-        ) from error
+        raise damaged(path, "a streamed SOG of version 1", reason(error)) from error
     parts = []
     for file, part_path in files.items():
         part = read_sog(part_path)
@@ -100,11 +98,6 @@ def _rows(path: Path, part: Gaussians, ranges: list[_Range], file: int) -> torch
     chosen = torch.zeros(len(part), dtype=torch.bool)
     for _, start, count in (found for found in ranges if found[0] == file):
         if start + count > len(part):
-            raise FileFormatError(
-                path,
-                expected=f"{start + count:,} Gaussians in file {file}",
-                found=f"{len(part):,}",
-                remedy=AGAIN,
-            )
+            raise damaged(path, f"{start + count:,} Gaussians in file {file}", f"{len(part):,}")
         chosen[start : start + count] = True
     return chosen.nonzero()[:, 0]

@@ -14,7 +14,7 @@ import torch
 
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import AGAIN, as_tensor, logits_of_bytes, read_content
+from lexsplat.scenes.formats.foreign import as_tensor, damaged, logits_of_bytes, read_content
 
 _LAYOUT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
@@ -45,12 +45,7 @@ def read_splat(path: Path) -> Gaussians:
     """
     content = read_content(path, ".splat")
     if not content or len(content) % _LAYOUT.itemsize:
-        raise FileFormatError(
-            path,
-            expected=f"a multiple of {_LAYOUT.itemsize} bytes",
-            found=f"{len(content)} bytes",
-            remedy=AGAIN,
-        )
+        raise damaged(path, f"a multiple of {_LAYOUT.itemsize} bytes", f"{len(content)} bytes")
     table = np.frombuffer(content, dtype=_LAYOUT)
     if (table["scale"] < 0).any():
         raise FileFormatError(

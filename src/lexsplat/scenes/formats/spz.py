@@ -30,6 +30,7 @@ from lexsplat.scenes.formats.foreign import (
     Damage,
     as_tensor,
     check_count,
+    damaged,
     logits_of_bytes,
     read_content,
     reason,
@@ -101,7 +102,7 @@ def read_spz(path: Path) -> Gaussians:
         else:
             streams, extensions = _inflated(content, sizes, bool(flags & _EXTENSIONS))
     except (zlib.error, zstandard.ZstdError, struct.error, Damage) as error:
-        raise FileFormatError(path, expected="an SPZ file", found=reason(error), remedy=AGAIN) from error
+        raise damaged(path, "an SPZ file", reason(error)) from error
     rotation = _rotation(extensions, path) if flags & _EXTENSIONS else HALF_TURN
     arrays = {
         name: np.frombuffer(data, np.uint8).reshape(count, layout[name]) for name, data in streams.items()
