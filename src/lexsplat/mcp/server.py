@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hmac
 import inspect
 import json
 import logging
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -22,9 +23,8 @@ from pydantic import ValidationError
 
 from lexsplat import __version__
 from lexsplat.mcp.arguments import check_names, nearest, wrong_value
-from lexsplat.mcp.library import LibraryTools
 from lexsplat.mcp.lines import messages
-from lexsplat.mcp.tools import Reply, Tools
+from lexsplat.mcp.tools import LibraryTools, Reply, Tools
 from lexsplat.mcp.writing import WritingTools
 from lexsplat.runtime.errors import LexsplatError, QueryError
 from lexsplat.scenes.library import Library
@@ -107,13 +107,13 @@ class _Server(MCPServer):
         try:
             return await super().read_resource(uri, context)
         except ResourceNotFoundError as error:
-            unknown = QueryError(
-                f"resource {str(uri)[:60]!r}",
-                expected=f"one of {', '.join(RESOURCES)}",
-                found="no such resource",
-                remedy=nearest(str(uri), RESOURCES[:1], "lexsplat://scenes has the names"),
-            )
-            raise _protocol_error(unknown) from error
+            with _protocol_errors():
+                raise QueryError(
+                    f"resource {str(uri)[:60]!r}",
+                    expected=f"one of {', '.join(RESOURCES)}",
+                    found="no such resource",
+                    remedy=nearest(str(uri), RESOURCES[:1], "lexsplat://scenes has the names"),
+                ) from error
 
     async def get_prompt(
         self, name: str, arguments: dict[str, Any] | None = None, context: Any = None
@@ -125,10 +125,8 @@ class _Server(MCPServer):
                 "properties": {each.name: {"type": "string"} for each in taken},
                 "required": [each.name for each in taken if each.required],
             }
-        try:
+        with _protocol_errors():
             check_names("prompt", name, arguments or {}, schemas)
-        except QueryError as error:
-            raise _protocol_error(error) from error
         return await super().get_prompt(name, arguments, context)
 
 
@@ -138,9 +136,13 @@ def _refusal(error: LexsplatError) -> CallToolResult:
     )
 
 
-def _protocol_error(error: LexsplatError) -> MCPError:
-    """An error where the protocol has no place for an answer."""
-    return MCPError(INVALID_PARAMS, str(error), error_document(error))
+@contextlib.contextmanager
+def _protocol_errors() -> Iterator[None]:
+    """Errors where the protocol has no place for an answer."""
+    try:
+        yield
+    except LexsplatError as error:
+        raise MCPError(INVALID_PARAMS, str(error), error_document(error)) from error
 
 
 def serve_http(server: MCPServer, listening: socket.socket, host: str, token: str | None) -> None:
@@ -232,37 +234,29 @@ def _add_resources(server: MCPServer, tools: Tools) -> None:
     @server.resource(RESOURCES[0], mime_type="application/json")
     def scenes() -> str:
         """The names and facts of all scenes."""
-        try:
+        with _protocol_errors():
             return json.dumps(tools.list_scenes().document)
-        except LexsplatError as error:
-            raise _protocol_error(error) from error
 
     @server.resource(RESOURCES[1], mime_type="application/json")
     def facts(name: str) -> str:
         """The answer of describe_scene."""
-        try:
+        with _protocol_errors():
             return json.dumps(tools.describe_scene(name).document)
-        except LexsplatError as error:
-            raise _protocol_error(error) from error
 
     @server.resource(RESOURCES[2], mime_type="image/png")
     def view(name: str, view: str) -> bytes:
         """A view as PNG."""
-        try:
+        with _protocol_errors():
             return tools.render(view, scene=name).image or b""
-        except LexsplatError as error:
-            raise _protocol_error(error) from error
 
 
 def _add_prompts(server: MCPServer, tools: Tools) -> None:
     def named(scene: str) -> str:
         if not scene:
             return "this place"
-        try:
+        with _protocol_errors():
             tools._scene(scene)
-            return f"the place {scene}"
-        except LexsplatError as error:
-            raise _protocol_error(error) from error
+        return f"the place {scene}"
 
     @server.prompt(name="inventory", title="Inventory this room")
     def inventory(scene: str = "") -> str:
@@ -278,9 +272,8 @@ def _add_prompts(server: MCPServer, tools: Tools) -> None:
         """Find a lost thing and describe in words where it is."""
         if not thing.strip():
             expected, found = "a word or phrase", "an empty text"
-            raise _protocol_error(
-                QueryError("thing", expected=expected, found=found, remedy="name what was lost")
-            )
+            with _protocol_errors():
+                raise QueryError("thing", expected=expected, found=found, remedy="name what was lost")
         return (
             f"Find {thing} in {named(scene)} with find. If it is present, describe its place by what is near it "
             "(relate, nearest) and show it with render(look_at=...). If it is not, say so and name what is similar."
