@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -33,36 +34,19 @@ def splat_codes(language: StoredLanguage) -> bytes:
 
 def segment_rule() -> dict[str, float]:
     """The constants by which the page takes or leaves segments: those of `lexsplat.queries.segments`."""
-    return {
-        "lowest": rule.LOWEST,
-        "border": rule.BORDER,
-        "own_share": rule.OWN_SHARE,
-        "steepness": rule.STEEPNESS,
-        "threshold": rule.SEGMENT_THRESHOLD,
-    }
+    named = constants_of(rule, "LOWEST", "BORDER", "OWN_SHARE", "STEEPNESS")
+    return {**named, "threshold": rule.SEGMENT_THRESHOLD}
 
 
 def part_rule() -> dict[str, float]:
     """The constants by which the page cuts parts of things: those of `lexsplat.queries.parts`."""
     return {
-        "fewest": parts.FEWEST,
-        "neighbors": parts.NEIGHBORS,
-        "color": parts.COLOR,
-        "score": parts.SCORE,
-        "rounds": parts.ROUNDS,
-        "shared": parts.SHARED,
-        "best": parts.BEST,
-        "lowest": parts.LOWEST,
-        "mostly": parts.MOSTLY,
-        "all": parts.ALL,
-        "usual": parts.USUAL,
-        "spread": parts.SPREAD,
+        **constants_of(parts, "FEWEST", "NEIGHBORS", "COLOR", "SCORE", "ROUNDS", "SHARED", "BEST", "LOWEST"),
+        **constants_of(parts, "MOSTLY", "ALL", "USUAL", "SPREAD"),
         "first": float(parts.PLACES[0]),
         "last": float(parts.PLACES[-1]),
         "steps": len(parts.PLACES),
-        "near": parts.NEAR,
-        "few": parts.FEW,
-        "outside": parts.OUTSIDE,
+        **constants_of(parts, "NEAR", "FEW", "OUTSIDE"),
     }
 
 
@@ -71,16 +55,17 @@ def selection_rule() -> dict[str, float]:
     return {
         "threshold": thresholds.BORDER,
         "link": clusters.LINK,
-        "smallest_share": selection.SMALLEST_SHARE,
-        "convincing": selection.CONVINCING,
-        "peak_count": selection.PEAK_COUNT,
-        "faint": selection.FAINT,
-        "same_surface": picking.SAME_SURFACE,
-        "least_surface": picking.LEAST_SURFACE,
+        **constants_of(selection, "SMALLEST_SHARE", "CONVINCING", "PEAK_COUNT", "FAINT"),
+        **constants_of(picking, "SAME_SURFACE", "LEAST_SURFACE"),
         "evidence_share": presence.PEAK_SHARE,
         "evidence_count": presence.PEAK_COUNT,
         "evidence_faint": presence.FAINT,
     }
+
+
+def constants_of(module: ModuleType, *names: str) -> dict[str, float]:
+    """Constants of a module by their names in small letters, as the page reads them."""
+    return {name.lower(): getattr(module, name) for name in names}
 
 
 def segments_file(segments: Segments, hidden: torch.Tensor) -> bytes:

@@ -14,6 +14,7 @@ from lexsplat.features.encoders import load_clip
 from lexsplat.queries import everyday, presence
 from lexsplat.queries.vocabulary import COLORS, NAMES, PARTS, QUALITIES
 from lexsplat.runtime.files import save_tensors
+from lexsplat.scenes.publishing.sidecar import constants_of
 from lexsplat.scenes.scene import Scene
 
 PRECISE_BYTES = 8_000_000
@@ -58,21 +59,10 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
         "padding": tower.padding,
         "templates": list(scene.query.templates),
         "everyday": {
-            "border": everyday.BORDER,
-            "steepness": everyday.STEEPNESS,
-            "offset": everyday.OFFSET,
-            "peak_share": everyday.PEAK_SHARE,
+            **constants_of(everyday, "BORDER", "STEEPNESS", "OFFSET", "PEAK_SHARE"),
             "peak": scene.everyday_scale.peak,
-            "yes": presence.YES,
-            "no": presence.NO,
-            "yes_segment": presence.YES_SEGMENT,
-            "yes_colored": presence.YES_COLORED,
-            "yes_part": presence.YES_PART,
-            "no_segment": presence.NO_SEGMENT,
-            "no_part": presence.NO_PART,
-            "at_thing": presence.AT_THING,
-            "border_part": presence.BORDER_PART,
-            "over_thing": presence.OVER_THING,
+            **constants_of(presence, "YES", "NO", "YES_SEGMENT", "YES_COLORED", "YES_PART", "NO_SEGMENT"),
+            **constants_of(presence, "NO_PART", "AT_THING", "BORDER_PART", "OVER_THING"),
             "names": sorted(NAMES),
             "qualities": sorted(QUALITIES),
             "colors": sorted(COLORS),
