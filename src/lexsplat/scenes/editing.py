@@ -19,7 +19,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.queries.selection import Selection
@@ -291,15 +290,13 @@ class Editor:
             )
         whole = self._whole(chosen, "fill" in values)
         if "fill" in values:
-            fill, mask = fill_for(whole, self._photographed_from(), self.original.listener)
+            cameras = [view.camera for view in self.original.views.values() if view.split == "train"]
+            fill, mask = fill_for(whole, cameras, self.original.listener)
             values, whole = {} if fill is None else {"fill": fill.to_json()}, replace(whole, mask=mask)
         step = Step(kind, whole.mask.clone().cpu(), values, chosen.phrase)
         with self._change(step.to_json()):
             self._advance(step)
             self.undone.clear()
-
-    def _photographed_from(self) -> list[Camera]:
-        return [view.camera for view in self.original.views.values() if view.split == "train"]
 
     @contextmanager
     def _change(self, entry: dict[str, Any]) -> Iterator[None]:

@@ -236,7 +236,8 @@ class Scene:
         unknown = {prompt: word for prompt, word in zip(prompts, words) if word.threshold is None}
         if unknown:
             with self._working:
-                self._find_thresholds(unknown)
+                for word, limit in zip(unknown.values(), automatic_thresholds(self, unknown)):
+                    word.threshold = limit
         limits = torch.tensor([word.threshold for word in words])
         return Answers(tuple(prompts), scores, limits, presences, self, words=tuple(words))
 
@@ -363,11 +364,6 @@ class Scene:
         # Copies: a row would keep the scores of all prompts asked with it.
         words = [Word(row.clone(), own.clone(), here) for row, own, here in zip(formed, scores, presences)]
         return [of_part(self, p, of_kind(self, p, word)) for p, word in zip(prompts, words)]
-
-    def _find_thresholds(self, words: Mapping[str, Word]) -> None:
-        """The automatic thresholds of words that have none yet."""
-        for word, threshold in zip(words.values(), automatic_thresholds(self, words)):
-            word.threshold = threshold
 
     # -- views
 

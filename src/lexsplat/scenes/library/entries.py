@@ -22,7 +22,6 @@ import math
 import os
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -31,7 +30,6 @@ from torch import Tensor
 
 from lexsplat.queries.everyday import OFFSET, EverydayScale, everyday_words
 from lexsplat.runtime.device import one_thread
-from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.files import write_tensors
 from lexsplat.runtime.fingerprints import digest
 from lexsplat.scenes.library.contents import Contents
@@ -123,17 +121,6 @@ class Codes:
         return cls(units.half(), units @ mean, limits, shares, torch.cat([fitted, (fitted @ mean)[None]]))
 
 
-class OwnTexts:
-    """The texts of a scene as a text tower: what its folder has cached needs no model."""
-
-    def __init__(self, scene: Scene, content_hash: str) -> None:
-        self.scene, self.content_hash = scene, content_hash
-
-    def encode_text(self, prompts: Any) -> Tensor:
-        """Embeddings ``[T, D]`` of texts."""
-        return self.scene.encode_text(list(prompts))
-
-
 def record_of(
     root: Path, name: str, path: str, scene: Scene, codes: Codes, contents: Contents | None
 ) -> Record:
@@ -147,8 +134,7 @@ def record_of(
         codes: Its codes.
         contents: Its segments and objects.
     """
-    if scene.folder is None:
-        raise SceneFolderError(name, expected="a scene in a folder", found="one in memory")
+    assert scene.folder is not None
     return Record(
         name=name,
         path=path,

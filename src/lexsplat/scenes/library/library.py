@@ -8,6 +8,8 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,7 +24,7 @@ from lexsplat.runtime.files import locked
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.library.contents import Contents, map_contents
-from lexsplat.scenes.library.entries import Codes, OwnTexts, map_codes, record_of, write_entry
+from lexsplat.scenes.library.entries import Codes, map_codes, record_of, write_entry
 from lexsplat.scenes.library.found import Found
 from lexsplat.scenes.library.identity import (
     in_use,
@@ -72,6 +74,8 @@ class Library:
 
     def __init__(self, root: str | Path, device: str = "auto", index: str | None = None) -> None:
         self.root, self._device = Path(root), device
+        self.stage = self.root / "scenes"
+        """The folder of the entries."""
         name = library_name(self.root)
         self.server = Server(index, name, self.root) if index else None
         self._home, self._texts = self.root.resolve(), TextCache(self.root / "texts")
@@ -103,11 +107,6 @@ class Library:
             return f"Library({str(self.root)!r}, gone)"
 
     # -- what it holds
-
-    @property
-    def stage(self) -> Path:
-        """The folder of the entries."""
-        return self.root / "scenes"
 
     def names(self) -> list[str]:
         """The names of all scenes, in order, also of those whose records cannot be read.
@@ -304,15 +303,13 @@ class Library:
             LibraryError: If another process changes the library, the disk is full, or the server fails.
         """
         with self.changing():
-            record = self.enter(path)
-        return record
+            return self.enter(path)
 
     def enter(self, path: str | Path, name: str | None = None) -> Record:
         """`add` under a name, while the library is locked (`changing`)."""
         scene = open_scene(path, device=self._device)
         scene.listener, folder = self.listener, scene.folder
-        if folder is None:
-            raise ValueError("a scene that was opened has a folder")
+        assert folder is not None
         place = BUNDLED if folder.is_bundled else str(folder.root.resolve())
         name = name or self._name_for(place, state_of(folder))
         before = self.record(name)
@@ -321,7 +318,8 @@ class Library:
         record = record_of(self.root, name, place, scene, codes, contents)
         write_entry(self.root, record, codes, contents)
         if known := scene.encoder_identity().get("encoder_hash"):  # all of its scenes get these texts
-            self._texts.encode(known, COMPARED, lambda: OwnTexts(scene, known))
+            own: Any = SimpleNamespace(content_hash=known, encode_text=scene.encode_text)
+            self._texts.encode(known, COMPARED, lambda: own)
         for file in before.files - record.files if before is not None else ():
             (self.stage / file).unlink(missing_ok=True)
         if self.server and self._served:

@@ -206,11 +206,8 @@ class Server:
         last = [1 - row[-1] for row in found["distances"] if len(row) == count]  # distance is 1 - product
         return names, max(last, default=-math.inf)
 
-    def repair(self, entries: Iterable[tuple[Record, Codes]], stage: Path) -> tuple[int, int]:
+    def repair(self, entries: Iterable[tuple[Record, Codes]], stage: Path) -> None:
         """Upload the scenes that the server lacks, and delete codes of scenes that the library does not hold.
-
-        Returns:
-            Number of scenes that were uploaded and number of codes that were deleted.
 
         Raises:
             LibraryError: If the server fails.
@@ -219,21 +216,17 @@ class Server:
         for record, codes in entries:
             wanted.setdefault(self._collection(record), []).append((record, codes))
         self._mark(_CHANGING)
-        uploaded = deleted = 0
         for place in (each.place for each in self._collections()):
             there = set(self._identifiers(place))
             for record, codes in wanted.get(place, []):
                 own = {_identifier(record, int(code)) for code in code_vectors(codes)[0]}
                 if not own <= there:
                     self._upsert(place, record, codes)
-                    uploaded += 1
                 there -= own
             strays = sorted(there)
             for start in range(0, len(strays), _BATCH):
                 self._delete(place, {"ids": strays[start : start + _BATCH]})
-            deleted += len(strays)
         self._mark(listing(stage))
-        return uploaded, deleted
 
     # -- the API
 

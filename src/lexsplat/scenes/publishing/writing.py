@@ -196,7 +196,7 @@ def _own_files(folder: Path) -> set[str]:
 
 def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[str, Any]:
     """Write everything but ``index.html`` and return the manifest, which is written as well."""
-    start = _start_view(scene, options.start_view)
+    start = None if options.start_view is None else scene.view(options.start_view).name
     scene.listener(Event(_STAGE, 0, _STEPS))
     kept = most_visible(scene.gaussians, options.max_splats or len(scene.gaussians))
     gaussians = scene.gaussians.select(kept.to(scene.gaussians.device)).to("cpu")
@@ -226,7 +226,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
         (folder / name).write_bytes(page_file(name))
     manifest = scene_manifest(scene, gaussians, splats.name, rotation, options.title, DRAWN_SPLATS)
     manifest["description"] = one_line(options.description)
-    manifest["scene"]["start_view"] = start
+    manifest["scene"]["start_view"] = start or manifest["scene"]["start_view"]
     manifest |= {
         "language": {
             "codes": "codes.bin",
@@ -262,12 +262,6 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     write_json(folder / "manifest.json", manifest)
     scene.listener(Event(_STAGE, _STEPS, _STEPS))
     return manifest
-
-
-def _start_view(scene: Scene, name: str | None) -> str:
-    if name is not None:
-        return scene.view(name).name
-    return min(scene.views, default="")
 
 
 def _write_folder(folder: Path, manifest: dict[str, Any], target: Path) -> int:
