@@ -77,7 +77,7 @@ class Collection:
 
 
 class Server:
-    """The collections of one library on a server.
+    """The collections of one library on a server. All methods raise `LibraryError` if it fails.
 
     Args:
         url: Its address, such as "http://localhost:8000".
@@ -108,11 +108,7 @@ class Server:
         self._known = False
 
     def check(self) -> None:
-        """Refuse a server that is not there or has another API; asked once.
-
-        Raises:
-            LibraryError: If it is not there or has another API.
-        """
+        """Refuse a server that is not there or has another API; asked once."""
         if self._known:
             return
         version = self._ask("GET", "/version")
@@ -126,11 +122,7 @@ class Server:
         self._known = True
 
     def put(self, record: Record, codes: Codes, stage: Path) -> None:
-        """Store the codes of a scene in place of those of an earlier version.
-
-        Raises:
-            LibraryError: If the server fails.
-        """
+        """Store the codes of a scene in place of those of an earlier version."""
         place = self._collection(record)
         self._mark(_CHANGING)
         self._delete(place, {"where": {"scene": record.name}})
@@ -138,11 +130,7 @@ class Server:
         self._mark(listing(stage))
 
     def drop(self, record: Record, stage: Path) -> None:
-        """Delete the codes of a scene.
-
-        Raises:
-            LibraryError: If the server fails.
-        """
+        """Delete the codes of a scene."""
         self._mark(_CHANGING)
         for each in self._collections():
             self._delete(each.place, {"where": {"scene": record.name}})
@@ -156,7 +144,7 @@ class Server:
             groups: The groups of its scenes.
 
         Raises:
-            LibraryError: If the server fails or holds another state of the library.
+            LibraryError: If the server holds another state of the library.
         """
         found = self._collections()
         problem = self._problem(found, stage, groups)
@@ -166,11 +154,7 @@ class Server:
         return found
 
     def is_current(self, stage: Path, groups: Set[str]) -> bool:
-        """Whether the server holds what the library holds; arguments as of `groups`.
-
-        Raises:
-            LibraryError: If the server fails.
-        """
+        """Whether the server holds what the library holds; arguments as of `groups`."""
         return not self._problem(self._collections(), stage, groups)
 
     def _problem(self, found: list[Collection], stage: Path, groups: Set[str]) -> str:
@@ -193,9 +177,6 @@ class Server:
 
         Returns:
             Their names, each once, and an upper limit for the bounds of the others; minus infinity if there are none.
-
-        Raises:
-            LibraryError: If the server fails.
         """
         asked = torch.cat([texts.cpu().float(), torch.tensor([[1.0, 0.0]]).expand(len(texts), 2)], dim=1)
         body = {
@@ -207,11 +188,7 @@ class Server:
         return names, max(last, default=-math.inf)
 
     def repair(self, entries: Iterable[tuple[Record, Codes]], stage: Path) -> None:
-        """Upload the scenes that the server lacks, and delete codes of scenes that the library does not hold.
-
-        Raises:
-            LibraryError: If the server fails.
-        """
+        """Upload the scenes that the server lacks, and delete codes of scenes that the library does not hold."""
         wanted: dict[str, list[tuple[Record, Codes]]] = {}
         for record, codes in entries:
             wanted.setdefault(self._collection(record), []).append((record, codes))
