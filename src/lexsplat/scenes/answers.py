@@ -109,16 +109,9 @@ class Answers:
     def _selection(self, index: int) -> Selection:
         scores = self.words[index].scores if self.words else self.scores[index]
         threshold = float(self.thresholds[index])
-        selection = Selection(
-            self.scene.gaussians,
-            self.scene.cameras,
-            scores >= threshold,
-            scores,
-            threshold,
-            self.presences[index],
-            self.prompts[index],
-            self.scene.world,
-            seen=self.scene.seen,
+        phrase, present = self.prompts[index], self.presences[index]
+        selection = self.scene.selection(
+            scores >= threshold, scores, threshold=threshold, present=present, phrase=phrase
         )
         if self.prompts[index].lower().split()[-1] in STUFF:
             seen = replace(selection, mask=self.chosen(index))

@@ -167,14 +167,7 @@ def _selections(scene: Scene, tensors: dict[str, Tensor], entries: list) -> tupl
     if numbers.shape != (len(scene.gaussians),) or tensors["boxes"].shape != (len(entries), 15):
         raise ValueError("it does not fit the scene")
     strengths = torch.cat([tensors["strengths"], torch.zeros(1)])  # the last one is that of no object
-    whole = Selection(
-        scene.gaussians,
-        scene.cameras,
-        (numbers >= 0).to(device),
-        strengths[numbers].to(device),
-        world=scene.world,
-        seen=scene.seen,
-    )
+    whole = scene.selection((numbers >= 0).to(device), strengths[numbers].to(device))
     members = numbers.sort(stable=True).indices.to(device)
     sizes = torch.bincount(numbers + 1, minlength=len(entries) + 1).tolist()
     found = []

@@ -107,15 +107,7 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     scores, shown = torch.zeros_like(segments.masses), ~scene.hidden
     for number in named[named >= 0].unique().tolist():
         mask, name = named[segments.labels] == number, words[number]
-        both = Selection(
-            scene.gaussians,
-            scene.cameras,
-            mask,
-            scores,
-            phrase=name,
-            world=scene.world,
-            seen=scene.seen,
-        )
+        both = scene.selection(mask, scores, phrase=name)
         for each in [both] if name in STUFF else both.instances:
             each = each.within(shown)
             if each:  # nothing is left of what no view shows

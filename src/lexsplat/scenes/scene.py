@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -317,6 +318,11 @@ class Scene:
             with self._working:
                 self._objects = self._objects or (self.kept.objects if self.kept else objects_of(self))
         return self._objects
+
+    def selection(self, mask: Tensor, scores: Tensor, **facts: Any) -> Selection:
+        """A selection of its Gaussians; the arguments are those of `Selection`."""
+        facts = {"world": self.world, "seen": self.seen, **facts}
+        return Selection(self.gaussians, self.cameras, mask, scores, **facts)
 
     def click(self, view: str | StoredView | Camera, x: float, y: float) -> Selection:
         """The surface at a pixel, and what is connected to it and means the same.
