@@ -113,24 +113,16 @@ class Answers:
         selection = self.scene.selection(
             scores >= threshold, scores, threshold=threshold, present=present, phrase=phrase
         )
-        if self.prompts[index].lower().split()[-1] in STUFF:
+        if phrase.lower().split()[-1] in STUFF:
             seen = replace(selection, mask=self.chosen(index))
             return replace(seen, parts=(seen,)) if seen else seen
-        members = self._members(index)
-        if members:
+        if present == "yes" and (members := _members(self.scene, phrase)):
             known = (each.within(selection.mask) for each in members)
             return replace(selection, parts=tuple(each.described(scores=scores) for each in known if each))
         selection = selection.without_specks()
         if self.automatic:
             selection = selection.convincing(self.words[index].own if self.words else None)
         return without_hidden(selection, self.scene.hidden)
-
-    def _members(self, index: int) -> list[Selection]:
-        """The objects of the kind that a prompt names; none where it names no kind or is absent."""
-        prompt = self.prompts[index]
-        if self.presences[index] != "yes" or self.scene.query.fixed or not is_kind(prompt):
-            return []
-        return [each for each in self.scene.objects if is_of_kind(each.phrase, prompt)]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON: ``{"answers": [...]}``, each as `Selection.to_dict`."""
@@ -155,15 +147,20 @@ def automatic_thresholds(scene: Scene, words: Mapping[str, Word]) -> list[float]
 
 def of_kind(scene: Scene, prompt: str, word: Word) -> Word:
     """The word as it is, or with the objects of its kind ("toy") if the scene has any (`lexsplat.queries.kinds`)."""
-    if not is_kind(prompt) or scene.query.fixed:
-        return word
-    members = [each for each in scene.objects if is_of_kind(each.phrase, prompt)]
+    members = _members(scene, prompt)
     if not members:
         return word
     taken = torch.stack([each.mask for each in members]).any(0)
     # Members reach the border, and all others stay below it.
     inside, outside = word.scores.clamp(min=BORDER), word.scores.clamp(max=BORDER - 1e-4)
     return replace(word, scores=torch.where(taken, inside, outside), presence="yes")
+
+
+def _members(scene: Scene, prompt: str) -> list[Selection]:
+    """The objects of the kind that a prompt names; none where it names no kind."""
+    if scene.query.fixed or not is_kind(prompt):
+        return []
+    return [each for each in scene.objects if is_of_kind(each.phrase, prompt)]
 
 
 def of_part(scene: Scene, prompt: str, word: Word) -> Word:
