@@ -39,7 +39,7 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
     stages = record["stages"]
     language = stages.get("language", {})
     codes = language if "codes" in language else stages.get("codebook", {})  # the stage that found them
-    facts: dict[str, Any] = {
+    return {
         "scene": str(folder.root),
         "capture": record.get("capture"),
         "chosen_views": _chosen_views(record),
@@ -65,4 +65,3 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "warnings": len(record.get("warnings", [])),
         "lexsplat": record.get("provenance", {}).get("lexsplat"),
     }
-    return facts

@@ -19,7 +19,7 @@ import contextlib
 import dataclasses
 import io
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -216,24 +216,21 @@ class SceneFolder:
         """Write ``scene.json``."""
         write_json(self._record_path, self.record)
 
-    @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
+    def locked(self) -> contextlib.AbstractContextManager[None]:
         """Lock the folder for one build; the lock ends with the process, however it ends.
 
         Raises:
             SceneFolderError: If another process holds the lock.
         """
-
-        def refusal(holder: str) -> SceneFolderError:
-            return SceneFolderError(
+        return locked(
+            self.root,
+            lambda holder: SceneFolderError(
                 self.root,
                 expected="a folder that no other process builds in",
                 found=f"process {holder} at work",
                 remedy="wait for it or give another --output",
-            )
-
-        with locked(self.root, refusal):
-            yield
+            ),
+        )
 
     def withdraw(self, made: Iterable[Path] = ()) -> None:
         """Remove the record of a build that ended before its first stage; a folder with other files stays.
@@ -332,13 +329,10 @@ class SceneFolder:
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, zlib.error) as error:
             raise FileFormatError(path, expected="a code index map", found=str(error)) from error
 
-    def bytes_on_disk(self, *paths: Path) -> int:
-        """Total size in bytes of the given files and folders, as far as they exist."""
-        total = 0
-        for path in paths:
-            files = path.rglob("*") if path.is_dir() else [path]
-            total += sum(file.stat().st_size for file in files if file.is_file())
-        return total
+    def bytes_on_disk(self, path: Path) -> int:
+        """Size in bytes of a file, or of all files in a folder; 0 if there is none."""
+        files = path.rglob("*") if path.is_dir() else [path]
+        return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def _pixel_data(content: bytes, size: tuple[int, int]) -> bytes:

@@ -33,7 +33,7 @@ def read_record(content: Any, path: Path) -> dict[str, Any]:
         SceneFolderError: If it is of another format version.
         FileFormatError: If an entry is of a wrong type.
     """
-    record = checked_record(content, path)
+    record = _checked(content, path)
     for part in ("stages", "config", "world"):
         if part in record:
             record[part] = _renamed(record[part])
@@ -51,13 +51,8 @@ def _renamed(value: Any, depth: int = 3) -> Any:
     return value
 
 
-def checked_record(record: Any, path: Path) -> dict[str, Any]:
-    """The content of ``scene.json``, checked for the types that the rest relies on.
-
-    Raises:
-        SceneFolderError: If it is of another format version.
-        FileFormatError: If an entry is of a wrong type.
-    """
+def _checked(record: Any, path: Path) -> dict[str, Any]:
+    """The content of ``scene.json``, checked for the types that the rest relies on."""
     version = record.get("format_version") if isinstance(record, dict) else None
     if version != FORMAT_VERSION or not isinstance(record.get("stages"), dict):
         raise SceneFolderError(
