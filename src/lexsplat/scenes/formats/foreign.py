@@ -42,6 +42,8 @@ _COARSE = 0.1
 """Largest error of centers without a warning, as a share of the usual standard deviation."""
 _SMALLEST_LOG_SCALE = math.log(1e-12)
 _SMALLEST_QUAT = 1e-18  # squares of smaller ones are 0 in float32
+_SMALLER = np.array([(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])
+"""The three other components of a quaternion."""
 _ALWAYS_ALLOWED = 10_000
 _MOST_PER_BYTE = 8
 
@@ -207,6 +209,23 @@ def logits_of_bytes(opacities: NDArray[np.uint8]) -> Tensor:
     """
     values = torch.from_numpy(opacities.astype(np.float32)) / 255
     return values.clamp(0.25 / 255, 1 - 0.25 / 255).logit()
+
+
+def without_the_largest(quats: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """The three smaller components of unit quaternions ``[N, 3]``, and which one is left out ``[N]`` as positive."""
+    largest = np.abs(quats).argmax(1)
+    signs = np.where(quats[np.arange(len(quats)), largest] < 0, -1, 1)[:, None]
+    return np.take_along_axis(quats * signs, _SMALLER[largest], 1), largest
+
+
+def with_the_largest(small: NDArray[np.float64], largest: NDArray[np.integer]) -> NDArray[np.float64]:
+    """The inverse of `without_the_largest` ``[N, 4]``; zeros where ``largest`` is none of 0 to 3."""
+    quats = np.zeros((len(small), 4))
+    for left_out, kept in enumerate(_SMALLER):
+        rows = largest == left_out
+        quats[np.ix_(rows, kept)] = small[rows]
+        quats[rows, left_out] = np.sqrt(np.maximum(0, 1 - (small[rows] ** 2).sum(1)))
+    return quats
 
 
 def as_tensor(values: NDArray) -> Tensor:

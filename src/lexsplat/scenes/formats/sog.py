@@ -34,6 +34,7 @@ from lexsplat.scenes.formats.foreign import (
     logits_of_bytes,
     read_content,
     reason,
+    with_the_largest,
 )
 
 META = "meta.json"
@@ -44,9 +45,6 @@ PALETTE_WIDTH = 64
 
 COEFFICIENTS = (0, 3, 8, 15)
 """Coefficients of the spherical harmonics for each number of bands."""
-
-SMALL = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
-"""Components wxyz that are stored, for each that is left out."""
 
 FIRST_TAG = 252
 """Alpha of a rotation whose w is left out; x, y and z follow."""
@@ -227,12 +225,7 @@ def _filled(pictures: Sequence[NDArray[np.uint8]]) -> int:
 def _quats(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Quaternions wxyz, zero where the tag is none of the four."""
     small = (pixels[:, :3] / 255 * 2 - 1) / math.sqrt(2)
-    quats = np.zeros((len(pixels), 4))
-    for left_out, kept in enumerate(SMALL):
-        rows = pixels[:, 3] == FIRST_TAG + left_out
-        quats[np.ix_(rows, kept)] = small[rows]
-        quats[rows, left_out] = np.sqrt(np.maximum(0, 1 - (small[rows] ** 2).sum(1)))
-    return quats
+    return with_the_largest(small, pixels[:, 3].astype(int) - FIRST_TAG)
 
 
 def _harmonics(

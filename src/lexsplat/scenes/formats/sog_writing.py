@@ -16,7 +16,8 @@ from PIL import Image
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.scenes.formats.sog import COEFFICIENTS, FIRST_TAG, META, PALETTE_WIDTH, SMALL
+from lexsplat.scenes.formats.foreign import without_the_largest
+from lexsplat.scenes.formats.sog import COEFFICIENTS, FIRST_TAG, META, PALETTE_WIDTH
 
 _TABLE = 256
 _TABLE_SAMPLE = 1 << 20
@@ -102,10 +103,7 @@ def _positions(means: NDArray[np.float64]) -> tuple[dict[str, NDArray[np.uint8]]
 
 def _quats(quats: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Smallest three components of unit quaternions wxyz; the one left out is positive."""
-    largest = np.abs(quats).argmax(1)
-    rows = np.arange(len(quats))
-    signs = np.where(quats[rows, largest] < 0, -1, 1)[:, None]
-    small = np.take_along_axis(quats * signs, np.array(SMALL)[largest], 1)
+    small, largest = without_the_largest(quats)
     stored = np.round((small * math.sqrt(2) + 1) / 2 * 255).clip(0, 255)
     return np.column_stack([stored, FIRST_TAG + largest]).astype(np.uint8)
 

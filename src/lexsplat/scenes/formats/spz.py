@@ -35,6 +35,8 @@ from lexsplat.scenes.formats.foreign import (
     read_content,
     reason,
     warn,
+    with_the_largest,
+    without_the_largest,
 )
 from lexsplat.scenes.transforms import transformed
 
@@ -244,12 +246,7 @@ def _quats(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
     largest = words >> 30
     fields = np.stack([words >> 20, words >> 10, words], 1) & 1023
     small = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / 511 * math.sqrt(0.5)
-    quats = np.zeros((len(words), 4))
-    for index in range(4):
-        rows, others = largest == index, [i for i in range(4) if i != index]
-        quats[np.ix_(rows, others)] = small[rows]
-        quats[rows, index] = np.sqrt(np.maximum(0, 1 - (small[rows] ** 2).sum(1)))
-    return quats[:, [3, 0, 1, 2]]
+    return with_the_largest(small, largest)[:, [3, 0, 1, 2]]
 
 
 def write_spz(gaussians: Gaussians, path: Path, *, version: int = 4) -> None:
@@ -338,13 +335,7 @@ def _bytes(values: Tensor) -> NDArray[np.uint8]:
 
 def _packed_quats(quats: NDArray[np.float64]) -> NDArray[np.uint32]:
     """Quaternions wxyz of unit length in 32 bits each; see `_quats`."""
-    xyzw = quats[:, [1, 2, 3, 0]]
-    largest = np.abs(xyzw).argmax(1)
-    rows = np.arange(len(xyzw))
-    xyzw = xyzw * np.where(xyzw[rows, largest] < 0, -1, 1)[:, None]
-    kept = np.arange(4)[None].repeat(len(xyzw), 0)
-    kept = kept[kept != largest[:, None]].reshape(-1, 3)
-    small = np.take_along_axis(xyzw, kept, 1)
+    small, largest = without_the_largest(quats[:, [1, 2, 3, 0]])
     fields = np.round(np.abs(small) * math.sqrt(2) * 511).clip(0, 511).astype(np.uint32)
     fields |= np.where(small < 0, 512, 0).astype(np.uint32)
     words = largest.astype(np.uint32) << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
