@@ -11,8 +11,7 @@ from pathlib import Path
 
 from lexsplat.runtime.errors import FileFormatError, LibraryError
 from lexsplat.runtime.files import locked, read_json, write_json
-from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.scenes.library.records import has_entries
+from lexsplat.scenes.library.records import has_entries, hash_of
 
 FORMAT_VERSION = 1
 _OWN = {"library.json", "scenes", "texts", "thumbnails"}
@@ -82,7 +81,7 @@ def make_library(root: Path) -> None:
             library_name(root)  # another process may have made it in the meantime
         except LibraryError:
             facts = {"format_version": FORMAT_VERSION, "name": uuid.uuid4().hex}
-            write_json(path, {**facts, "hash": _hash(facts)})
+            write_json(path, {**facts, "hash": hash_of(facts)})
 
 
 def in_use(root: Path, holder: str) -> LibraryError:
@@ -151,10 +150,6 @@ def _mending(root: Path, otherwise: str) -> str:
 
 def _is_intact(facts: dict) -> bool:
     try:
-        return bool(facts.get("hash") == _hash(facts))
+        return bool(facts.get("hash") == hash_of(facts))
     except (ValueError, RecursionError):  # text that no file can hold, or brackets nested too deeply
         return False
-
-
-def _hash(facts: dict) -> str:
-    return fingerprint({name: value for name, value in facts.items() if name != "hash"})

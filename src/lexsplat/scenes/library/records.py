@@ -143,7 +143,7 @@ def checked_record(content: Any, path: Path) -> Record:
     try:
         if not isinstance(content, dict):
             raise ValueError("other values")
-        if _HASH in content and content[_HASH] != _hash(content):
+        if _HASH in content and content[_HASH] != hash_of(content):
             raise ValueError("damaged content (the hash differs)")
         values: dict[str, Any] = {
             field.name: (int if field.type == "int" else str)(content[field.name])
@@ -213,7 +213,8 @@ def _own_files(stage: Path) -> list[tuple[str, str]]:
     return [(file, found[1]) for file in listed if (found := OWN_FILE.fullmatch(file))]
 
 
-def _hash(content: Mapping[str, Any]) -> str:
+def hash_of(content: Mapping[str, Any]) -> str:
+    """The hash of all other values, which is written with them."""
     return fingerprint({name: value for name, value in content.items() if name != _HASH})
 
 
