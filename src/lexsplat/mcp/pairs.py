@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,62 +13,43 @@ from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.serving import shortened
 
 
-class Pair(NamedTuple):
-    """Two different things.
-
-    Args:
-        gap: The distance between their surfaces, world units.
-        first: One thing.
-        second: Another thing.
-    """
-
-    gap: float
-    first: Selection
-    second: Selection
-
-
-def nearest_pair(firsts: Sequence[Selection], seconds: Sequence[Selection]) -> Pair | None:
+def different(
+    firsts: Sequence[Selection], seconds: Sequence[Selection], asked: str
+) -> tuple[float, Selection, Selection]:
     """The two different things with the smallest gap; of equal gaps, with the nearest centers.
 
     Args:
         firsts: What the first one is chosen from.
         seconds: What the second one is chosen from; it may share things with ``firsts``.
+        asked: The subject of the error.
 
     Returns:
-        The pair; None if there is only one thing.
+        The distance between their surfaces, world units, and the two.
+
+    Raises:
+        QueryError: If there is only one thing.
     """
     centers = [np.array([one.center for one in things]).reshape(-1, 3) for things in (firsts, seconds)]
     reaches = [np.array([_reach(one) for one in things]) for things in (firsts, seconds)]
     apart = np.linalg.norm(centers[0][:, None] - centers[1][None], axis=2)
     least = np.maximum(apart - reaches[0][:, None] - reaches[1][None], 0)
-    best: tuple[float, float, Pair] | None = None
+    best: tuple[float, float, Selection, Selection] | None = None
     for number in np.lexsort((apart.ravel(), least.ravel())):  # none after a larger bound can be nearer
         row, column = divmod(int(number), len(seconds))
         if best is not None and least[row, column] > best[0]:
             break
-        if same(firsts[row], seconds[column]):
-            continue
-        pair = Pair(distance(firsts[row], seconds[column]), firsts[row], seconds[column])
-        key = (pair.gap, float(apart[row, column]), pair)
-        best = key if best is None or key[:2] < best[:2] else best
-    return None if best is None else best[2]
-
-
-def different(firsts: Sequence[Selection], seconds: Sequence[Selection], asked: str) -> Pair:
-    """`nearest_pair`, which must exist.
-
-    Raises:
-        QueryError: If there is only one thing; its subject is ``asked``.
-    """
-    pair = nearest_pair(firsts, seconds)
-    if pair is None:
+        first, second = firsts[row], seconds[column]
+        if not same(first, second):
+            pair = (distance(first, second), float(apart[row, column]), first, second)
+            best = pair if best is None or pair[:2] < best[:2] else best
+    if best is None:
         raise QueryError(
             asked,
             expected="two different things",
             found=f"one thing alone, {called(firsts[0], firsts)}",
             remedy='name another target, such as "thing" for any object',
         )
-    return pair
+    return best[0], best[2], best[3]
 
 
 def measured(*ends: tuple[Selection, Sequence[Selection], dict[str, Any]]) -> str:
