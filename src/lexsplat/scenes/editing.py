@@ -115,27 +115,24 @@ def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> 
 
 @dataclass(frozen=True)
 class Motion:
-    """A similarity transform of a selection: x -> scale R (x - center) + center + translation.
+    """A similarity transform of a selection about the center c of its box: x -> scale R (x - c) + c + translation.
 
     Args:
         translation: ``[3]``, world units.
         rotation: R ``[3, 3]``, a proper rotation; None is the identity.
         scale: Factor on sizes, positive.
-        center: Fixed point of rotation and scaling ``[3]``; None takes the center of the selection's box.
     """
 
     translation: Sequence[float] = (0.0, 0.0, 0.0)
     rotation: NDArray[np.float64] | None = None
     scale: float = 1.0
-    center: Sequence[float] | None = None
 
     def values(self, chosen: Selection) -> dict[str, Any]:
         """The numbers of a `Step` that moves ``chosen``."""
-        place: Any = chosen.center if chosen else np.zeros(3)
         vectors = {
             "rotation": np.eye(3) if self.rotation is None else self.rotation,
             "translation": self.translation,
-            "center": place if self.center is None else self.center,
+            "center": chosen.center if chosen else np.zeros(3),
         }
         numbers = {name: np.asarray(value, float).tolist() for name, value in vectors.items()}
         return {**numbers, "scale": float(self.scale)}
