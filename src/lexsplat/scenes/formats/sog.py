@@ -17,7 +17,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -55,7 +55,8 @@ _BYTES_A_PIXEL = 8
 _FURTHER_BYTES = 16 << 20
 _FURTHER_PIXELS = 1 << 20  # a palette of 65,536 entries with 15 coefficients
 
-_Load = Callable[[str, int], bytes]
+_Part = Callable[[str], IO[bytes]]
+"""Opens a part by its name."""
 
 
 def read_sog(path: Path) -> Gaussians:
@@ -66,39 +67,32 @@ def read_sog(path: Path) -> Gaussians:
     """
     try:
         if path.name == META:
-            return _read(path, lambda name, limit: _beside(path, name, limit), _total_size(path))
+            size = sum(file.stat().st_size for file in path.parent.iterdir() if file.suffix == ".webp")
+            return _read(path, lambda name: open(path.with_name(name), "rb"), size)
         with zipfile.ZipFile(io.BytesIO(read_content(path, ".sog"))) as archive:
-            return _read(path, lambda name, limit: _in_archive(archive, name, limit), path.stat().st_size)
+            return _read(path, lambda name: _in_archive(archive, name), path.stat().st_size)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise damaged(path, "a SOG archive", "no whole zip archive") from error
     except (KeyError, TypeError, IndexError, ValueError, AttributeError, OverflowError, OSError) as error:
         raise damaged(path, "a SOG of version 1 or 2", reason(error)) from error
 
 
-def _total_size(path: Path) -> int:
-    return sum(file.stat().st_size for file in path.parent.iterdir() if file.suffix == ".webp")
-
-
-def _beside(path: Path, name: str, limit: int) -> bytes:
-    with open(path.with_name(name), "rb") as file:
-        return _whole(file.read(limit + 1), name, limit)
-
-
-def _in_archive(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
+def _in_archive(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
     if name not in archive.namelist():
         raise Damage(f"no {name} in the archive")
-    with archive.open(name) as file:
-        return _whole(file.read(limit + 1), name, limit)
+    return archive.open(name)
 
 
-def _whole(content: bytes, name: str, limit: int) -> bytes:
+def _content(part_of: _Part, name: str, limit: int) -> bytes:
+    with part_of(name) as file:
+        content = file.read(limit + 1)
     if len(content) > limit:
         raise Damage(f"{name} has more than {limit:,} bytes")
     return content
 
 
-def _read(path: Path, load: _Load, size: int) -> Gaussians:
-    meta = json.loads(load(META, _LARGEST_META))
+def _read(path: Path, part_of: _Part, size: int) -> Gaussians:
+    meta = json.loads(_content(part_of, META, _LARGEST_META))
     version = meta.get("version", 1)
     if version not in (1, 2):
         raise FileFormatError(
@@ -113,7 +107,7 @@ def _read(path: Path, load: _Load, size: int) -> Gaussians:
     check_count(path, count, size)
 
     def pixels(part: str, index: int = 0) -> NDArray[np.uint8]:
-        return _pixels(load, meta[part]["files"][index], count).reshape(-1, 4)
+        return _pixels(part_of, meta[part]["files"][index], count).reshape(-1, 4)
 
     def picture(part: str, index: int = 0) -> NDArray[np.uint8]:
         return pixels(part, index)[:count]
@@ -136,18 +130,18 @@ def _read(path: Path, load: _Load, size: int) -> Gaussians:
         log_scales=as_tensor(_looked_up(table(meta["scales"]), picture("scales")[:, :3])),
         opacity_logits=logits,
         sh0=as_tensor(_looked_up(colors, sh0[:, :3]))[:, None],
-        shN=as_tensor(_harmonics(load, meta["shN"], picture("shN", 1), table(meta["shN"])))
+        shN=as_tensor(_harmonics(part_of, meta["shN"], picture("shN", 1), table(meta["shN"])))
         if meta.get("shN")
         else torch.zeros(count, 0, 3),
         antialiased=meta.get("model") == "antialiased",
     )
 
 
-def _pixels(load: _Load, name: str, count: int) -> NDArray[np.uint8]:
+def _pixels(part_of: _Part, name: str, count: int) -> NDArray[np.uint8]:
     """An image ``[H, W, 4]`` of at least ``count`` pixels, and not of many more."""
     if not isinstance(name, str) or Path(name).name != name or "\\" in name:
         raise Damage(f"a part named {str(name)[:80]!r}")
-    content = load(name, _BYTES_A_PIXEL * count + _FURTHER_BYTES)
+    content = _content(part_of, name, _BYTES_A_PIXEL * count + _FURTHER_BYTES)
     try:
         picture = Image.open(io.BytesIO(content), formats=["WEBP"])
         if not count <= picture.width * picture.height <= 4 * count + _FURTHER_PIXELS:
@@ -229,10 +223,10 @@ def _quats(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def _harmonics(
-    load: _Load, part: dict[str, Any], labels: NDArray[np.uint8], table: NDArray[np.float32]
+    part_of: _Part, part: dict[str, Any], labels: NDArray[np.uint8], table: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Coefficients ``[N, 3 | 8 | 15, 3]`` of the palette's entries."""
-    picture = _pixels(load, part["files"][0], COEFFICIENTS[3])
+    picture = _pixels(part_of, part["files"][0], COEFFICIENTS[3])
     bands = part.get("bands", _BANDS.get(picture.shape[1]))  # version 1 has the width of the image alone
     width, entries = COEFFICIENTS[bands] if bands in (1, 2, 3) else 0, part.get("count", 1 << 16)
     if not width or type(entries) is not int or not 0 < entries <= 1 << 16:
