@@ -219,7 +219,7 @@ def answer_queries(
     ]
     for done, name in enumerate(names):
         scene.listener(Event("views", done, len(names)))
-        image = _to_uint8(scene.render(name).image)
+        image = (scene.render(name).image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
         relevancy = scene.relevancy(found.prompts, name).cpu().numpy()
         for answer, limit, values in zip(answers, thresholds, relevancy):
             answer["views"][name] = _write_images(
@@ -349,7 +349,3 @@ def file_names(prompts: Sequence[str]) -> dict[str, str]:
         )
         names[prompt] = next(name for name in numbered if name not in names.values())
     return names
-
-
-def _to_uint8(image: torch.Tensor) -> np.ndarray:
-    return (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()

@@ -129,17 +129,13 @@ def read_record(path: Path) -> Record:
         FileFormatError: If it is damaged.
     """
     try:
-        return checked_record(read_json(path), path)
+        return _checked(read_json(path), path)
     except FileFormatError as error:
         raise damaged(path, error.expected, error.found) from error
 
 
-def checked_record(content: Any, path: Path) -> Record:
-    """A record from plain data.
-
-    Raises:
-        FileFormatError: If an entry is missing, of a wrong type or altered.
-    """
+def _checked(content: Any, path: Path) -> Record:
+    """A record from plain data, of which no entry is missing, of a wrong type or altered."""
     try:
         if not isinstance(content, dict):
             raise ValueError("other values")
@@ -165,7 +161,7 @@ def copy_of_record(path: Path) -> Record | None:
     """The copy of a record in the file of the codes; None if it is damaged."""
     try:
         _, metadata = read_tensors(path)
-        return checked_record(json.loads(metadata["record"]), path)
+        return _checked(json.loads(metadata["record"]), path)
     except (FileFormatError, KeyError, ValueError, RecursionError):
         return None
 
