@@ -24,7 +24,7 @@ from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import BackendError, FileFormatError
-from lexsplat.scenes.formats.foreign import Damage, damaged, read_content, reason, warn
+from lexsplat.scenes.formats.foreign import Damage, damaged, parsing, read_content, warn
 from lexsplat.scenes.formats.ply import MIP, is_antialiased, parse_ply, write_ply
 from lexsplat.scenes.formats.ply_elements import (
     byte_order,
@@ -127,7 +127,7 @@ def _chunked_count(lines: list[str], content: bytes, path: Path) -> int:
 
 def _sectioned_count(content: bytes, path: Path) -> int:
     """Number of Gaussians of a ``.ksplat``, which must be that of its sections and of its data."""
-    try:
+    with parsing(path, "a ksplat file"):
         sections, _, _, count, level = _KSPLAT.unpack_from(content)
         place, held = _KSPLAT_HEADER + _KSPLAT_SECTION * sections, 0
         if level not in _KSPLAT_BYTES or place > len(content):
@@ -146,8 +146,6 @@ def _sectioned_count(content: bytes, path: Path) -> int:
             raise Damage(f"{held:,} Gaussians in sections, and {len(content):,} bytes instead of {place:,}")
         if held != count:
             raise Damage(f"a count of {count:,}, and {held:,} Gaussians in sections")
-    except (struct.error, Damage) as error:
-        raise damaged(path, "a ksplat file", reason(error)) from error
     if place < len(content):
         warn("%s: %d bytes after the last Gaussian are ignored", path, len(content) - place)
     return int(count)

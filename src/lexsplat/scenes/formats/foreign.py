@@ -11,6 +11,8 @@ import contextlib
 import json
 import logging
 import math
+import struct
+import zlib
 from collections.abc import Iterator
 from contextvars import ContextVar
 from dataclasses import replace
@@ -36,6 +38,10 @@ AROUND = 5
 AGAIN, EXPORT_AGAIN = "copy the file again or export it again", "export the file again"
 """The remedies for damage, and for content that copying cannot have changed."""
 
+_CAUSED = (
+    ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, OSError,
+    struct.error, zlib.error,
+)  # fmt: skip
 _logged: ContextVar[set[str] | None] = ContextVar("logged", default=None)
 _LARGEST_LOGIT = 20.0
 _COARSE = 0.1
@@ -71,6 +77,15 @@ def reason(error: Exception) -> str:
     elif isinstance(error, KeyError) and error.args:
         text = f"no {error.args[0]!r:.80}"
     return " ".join(f"damaged content{': ' if text else ''}{text}".split())[:240]
+
+
+@contextlib.contextmanager
+def parsing(path: Path, expected: str, *further: type[Exception]) -> Iterator[None]:
+    """Errors that damaged content causes in this block, and ``further`` ones, as errors of the file."""
+    try:
+        yield
+    except (*_CAUSED, *further) as error:
+        raise damaged(path, expected, reason(error)) from error
 
 
 @contextlib.contextmanager

@@ -27,10 +27,9 @@ from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.foreign import (
     Damage,
     as_tensor,
-    damaged,
     joined,
+    parsing,
     read_content,
-    reason,
     rounded_centers,
     warn,
 )
@@ -42,10 +41,6 @@ _UPRIGHT = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_DAMAGE = (
-    ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError, struct.error, OSError,
-)  # fmt: skip
-"""Errors that damaged content causes."""
 _UNDERSTOOD = {EXTENSION, "KHR_mesh_quantization"}
 
 
@@ -56,7 +51,7 @@ def read_gltf(path: Path) -> Gaussians:
         FileFormatError: If the file is damaged, requires an extension that is not supported, has no splats, or a node
             deforms them.
     """
-    try:
+    with parsing(path, f"glTF with {EXTENSION}"):
         document, binary = _parts(read_content(path, "glTF"))
         file = _Document(document, binary, path)
         unknown = set(document.get("extensionsRequired", [])) - _UNDERSTOOD
@@ -70,10 +65,6 @@ def read_gltf(path: Path) -> Gaussians:
             _placed(file.gaussians(primitive), np.eye(4) if own else _UPRIGHT @ world, path)
             for primitive, world in file.splats()
         ]
-    except FileFormatError:
-        raise
-    except _DAMAGE as error:
-        raise damaged(path, f"glTF with {EXTENSION}", reason(error)) from error
     if not parts:
         raise FileFormatError(
             path,

@@ -32,8 +32,8 @@ from lexsplat.scenes.formats.foreign import (
     check_count,
     damaged,
     logits_of_bytes,
+    parsing,
     read_content,
-    reason,
     with_the_largest,
 )
 
@@ -65,16 +65,15 @@ def read_sog(path: Path) -> Gaussians:
     Raises:
         FileFormatError: If a part is missing or damaged, larger than its count allows, or of another version.
     """
-    try:
-        if path.name == META:
-            size = sum(file.stat().st_size for file in path.parent.iterdir() if file.suffix == ".webp")
-            return _read(path, lambda name: open(path.with_name(name), "rb"), size)
-        with zipfile.ZipFile(io.BytesIO(read_content(path, ".sog"))) as archive:
-            return _read(path, lambda name: _in_archive(archive, name), path.stat().st_size)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        raise damaged(path, "a SOG archive", "no whole zip archive") from error
-    except (KeyError, TypeError, IndexError, ValueError, AttributeError, OverflowError, OSError) as error:
-        raise damaged(path, "a SOG of version 1 or 2", reason(error)) from error
+    with parsing(path, "a SOG of version 1 or 2"):
+        try:
+            if path.name == META:
+                size = sum(file.stat().st_size for file in path.parent.iterdir() if file.suffix == ".webp")
+                return _read(path, lambda name: open(path.with_name(name), "rb"), size)
+            with zipfile.ZipFile(io.BytesIO(read_content(path, ".sog"))) as archive:
+                return _read(path, lambda name: _in_archive(archive, name), path.stat().st_size)
+        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+            raise damaged(path, "a SOG archive", "no whole zip archive") from error
 
 
 def _in_archive(archive: zipfile.ZipFile, name: str) -> IO[bytes]:

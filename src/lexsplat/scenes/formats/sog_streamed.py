@@ -14,7 +14,7 @@ import torch
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import Damage, damaged, joined, read_content, reason, warn
+from lexsplat.scenes.formats.foreign import Damage, damaged, joined, parsing, read_content, warn
 from lexsplat.scenes.formats.sog import read_sog
 
 LOD_META = "lod-meta.json"
@@ -31,7 +31,7 @@ def read_streamed_sog(path: Path) -> Gaussians:
         FileFormatError: If a part is missing, damaged or outside the folder, or the version is unknown.
     """
     content = read_content(path, LOD_META)
-    try:
+    with parsing(path, "a streamed SOG of version 1"):
         meta = json.loads(content)
         if meta.get("version", 1) != 1:
             raise Damage(f"version {meta['version']!r:.40}")
@@ -40,16 +40,6 @@ def read_streamed_sog(path: Path) -> Gaussians:
         ranges = sorted({found for is_finest, found in levels if is_finest})
         files = {file: _inside(path, _named(names, file)) for file, _, _ in ranges}
         environment = [_inside(path, meta["environment"])] if meta.get("environment") else []
-    except (
-        LookupError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        ArithmeticError,
-        OSError,
-        RecursionError,
-    ) as error:
-        raise damaged(path, "a streamed SOG of version 1", reason(error)) from error
     parts = []
     for file, part_path in files.items():
         part = read_sog(part_path)

@@ -30,10 +30,9 @@ from lexsplat.scenes.formats.foreign import (
     Damage,
     as_tensor,
     check_count,
-    damaged,
     logits_of_bytes,
+    parsing,
     read_content,
-    reason,
     warn,
     with_the_largest,
     without_the_largest,
@@ -89,7 +88,7 @@ def read_spz(path: Path) -> Gaussians:
         FileFormatError: If the file is damaged or has another version.
     """
     content = read_content(path, ".spz")
-    try:
+    with parsing(path, "an SPZ file", zstandard.ZstdError):
         head = zlib.decompressobj(31).decompress(content, 16) if content[:2] == b"\x1f\x8b" else content[:32]
         if len(head) < _HEADER.size:
             raise Damage(f"a header of {len(head)} bytes")
@@ -103,8 +102,6 @@ def read_spz(path: Path) -> Gaussians:
             extensions = content[_HEADER_4.size : _HEADER_4.unpack_from(content)[-1]]
         else:
             streams, extensions = _inflated(content, sizes, bool(flags & _EXTENSIONS))
-    except (zlib.error, zstandard.ZstdError, struct.error, Damage) as error:
-        raise damaged(path, "an SPZ file", reason(error)) from error
     rotation = _rotation(extensions, path) if flags & _EXTENSIONS else HALF_TURN
     arrays = {
         name: np.frombuffer(data, np.uint8).reshape(count, layout[name]) for name, data in streams.items()
