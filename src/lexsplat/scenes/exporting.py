@@ -104,7 +104,7 @@ def export_gaussians(
     if language is not None and ending == ".ply":
         written.append(codebook_path(path))
     if not overwrite:
-        refuse_existing(written)
+        _refuse_existing(written)
     if len(written) > 1 and language is not None:
         with atomic_path(written[-1]) as temporary:
             write_codebook(language, temporary)
@@ -144,7 +144,7 @@ def export_scene(
         scene.folder.refuse_own_file(path)
     if ending in LABEL_ENDINGS and found:
         if not overwrite:
-            refuse_existing([path])
+            _refuse_existing([path])
         with atomic_path(path) as temporary:
             if ending == ".csv":
                 labels, scores = best_labels(found)
@@ -171,12 +171,7 @@ def export_scene(
     return export_gaussians(gaussians, path, language=stored, world=scene.world, overwrite=overwrite)
 
 
-def refuse_existing(files: Sequence[Path]) -> None:
-    """Refuse to replace files.
-
-    Raises:
-        SceneFolderError: If one exists.
-    """
+def _refuse_existing(files: Sequence[Path]) -> None:
     for path in files:
         if path.exists():
             raise SceneFolderError(

@@ -21,7 +21,7 @@ def length_between(scene: Scene, first: str, second: str) -> float:
     Raises:
         QueryError: If one is not found, or they are the same.
     """
-    things = [the_thing(scene, phrase) for phrase in (first, second)]
+    things = [_the_thing(scene, phrase) for phrase in (first, second)]
     return positive_length(things[0].distance_to(things[1]), f"{first} and {second}")
 
 
@@ -31,15 +31,11 @@ def height_of(scene: Scene, phrase: str) -> float:
     Raises:
         QueryError: If it is not found.
     """
-    return positive_length(float(the_thing(scene, phrase).size[2]), phrase)
+    return positive_length(float(_the_thing(scene, phrase).size[2]), phrase)
 
 
-def the_thing(scene: Scene, phrase: str) -> Selection:
-    """The largest instance that matches a phrase; logs a warning if there are several or perhaps none.
-
-    Raises:
-        QueryError: If nothing matches.
-    """
+def _the_thing(scene: Scene, phrase: str) -> Selection:
+    """The largest instance that matches a phrase; logs a warning if there are several or perhaps none."""
     found = scene.find(phrase)
     if not found:
         raise QueryError(phrase, expected="something in the scene", found="nothing")

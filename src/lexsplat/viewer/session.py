@@ -27,7 +27,7 @@ from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.exporting import export_gaussians
 from lexsplat.scenes.journal import journal_of
-from lexsplat.scenes.publishing.manifest import checksums, listed_objects, object_entries, scene_manifest
+from lexsplat.scenes.publishing.manifest import MOST_OBJECTS, checksums, object_entries, scene_manifest
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.vocabulary import NAME, page_phrases, words_file
 from lexsplat.scenes.publishing.writing import MOST_SPLATS
@@ -148,7 +148,7 @@ class Session:
 
     def objects(self) -> list[dict[str, Any]]:
         """The objects of the scene for its list."""
-        return object_entries(listed_objects(self.scene))
+        return object_entries(self.scene.objects[:MOST_OBJECTS])
 
     def colors(self, mode: str) -> bytes:
         """RGB of each drawn Gaussian; see `lexsplat.viewer.coloring`."""

@@ -83,15 +83,6 @@ def _name(scene: Scene) -> str:
     return "demo" if scene.folder.is_bundled else scene.folder.root.resolve().name
 
 
-def listed_objects(scene: Scene) -> tuple[Selection, ...]:
-    """The objects of the list.
-
-    Raises:
-        ModelError: If the text encoder cannot be loaded.
-    """
-    return scene.objects[:MOST_OBJECTS]
-
-
 def object_entries(objects: Sequence[Selection]) -> list[dict[str, Any]]:
     """Name, center and size of objects, in world units, and in meters where the scale is known."""
     entries = []

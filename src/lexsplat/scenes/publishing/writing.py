@@ -22,10 +22,10 @@ from lexsplat.scenes.publishing.index import PAGE_FILES, folder_index, page_file
 from lexsplat.scenes.publishing.manifest import (
     DRAWN_SPLATS,
     FORMAT,
+    MOST_OBJECTS,
     checksums,
     colored_entries,
     kind_entries,
-    listed_objects,
     one_line,
     scene_manifest,
 )
@@ -209,7 +209,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     if segments is not None:
         (folder / "segments.bin").write_bytes(segments_file(segments.select(kept), scene.hidden.cpu()[kept]))
     scene.listener(Event(_STAGE, 2, _STEPS))
-    objects = listed_objects(scene)
+    objects = scene.objects[:MOST_OBJECTS]
     (folder / "objects.bin").write_bytes(objects_file(objects, kept))
     scene.listener(Event(_STAGE, 3, _STEPS))
     phrases = page_phrases(asked_phrases(scene), bundled=scene.clip == "bundled")
