@@ -103,15 +103,8 @@ def open_scenes(paths: Sequence[str], device: str = "auto", clip: str | None = N
 
 def error_document(error: LexsplatError) -> dict[str, Any]:
     """An error as plain data for JSON."""
-    return {
-        "error": {
-            "message": str(error),
-            "subject": error.subject,
-            "expected": error.expected,
-            "found": error.found,
-            "remedy": error.remedy,
-        }
-    }
+    parts = {name: getattr(error, name) for name in ("subject", "expected", "found", "remedy")}
+    return {"error": {"message": str(error), **parts}}
 
 
 def sentence(answer: Mapping[str, Any], meters_per_unit: float | None = None) -> str:
