@@ -1,19 +1,23 @@
-"""The two stages of a search in a library: bounds from codes, then answers from the index or of the scenes."""
+"""The two stages of a search in a library: bounds from codes, then answers from the index or of the scenes.
+
+The answer also tells what was not understood of a phrase, and what was searched in other words.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from torch import Tensor
 
-from lexsplat.queries.grammar import understand
-from lexsplat.queries.kinds import is_of_kind, words_of_things
-from lexsplat.queries.phrases import Phrase, Thing, things_of
+from lexsplat.queries.grammar import thing_of, understand
+from lexsplat.queries.kinds import is_of_kind, unknown_note, words_of_things
+from lexsplat.queries.phrases import Phrase, Thing, Understood, things_of, with_things
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import PRESENCES
-from lexsplat.queries.spelling import spellings
+from lexsplat.queries.spelling import corrected, spellings
 from lexsplat.queries.vocabulary import default_vocabulary
 from lexsplat.runtime.errors import FileFormatError, LexsplatError, QueryError
 from lexsplat.runtime.progress import Event
@@ -23,8 +27,8 @@ from lexsplat.scenes.library.bounds import CERTAIN, SURELY_NOT, phrase_bound, pr
 from lexsplat.scenes.library.found import Found, Hit
 from lexsplat.scenes.library.indexed import Indexed, answer_from, decidable, with_world
 from lexsplat.scenes.library.mending import orphans, rebuilt
-from lexsplat.scenes.library.noting import note_of
 from lexsplat.scenes.library.records import Record
+from lexsplat.scenes.serving import shortened
 
 if TYPE_CHECKING:
     from lexsplat.scenes.library.library import Library
@@ -35,6 +39,8 @@ _ASKED = 4
 """Largest number of scenes examined for each scene of the answer."""
 _REBUILT = 2
 """Rebuilt scenes examined before the others, for each scene of the answer."""
+_NAMED = 3
+"""Scenes that a note names, at most."""
 
 
 def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> Found:
@@ -66,7 +72,7 @@ def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> 
     return Found(
         phrase=asking.text,
         understood=hits[0].answer["understood"] if hits else str(asked_for.phrase),
-        note=note_of(asked_for, hits, possible.encoders),
+        note=_note_of(asked_for, hits, possible.encoders),
         hits=tuple(hits),
         scenes=len(names),
         opened=opened,
@@ -75,6 +81,64 @@ def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> 
         rebuilt=possible.rebuilt,
         encoders=possible.encoders,
     )
+
+
+def _note_of(asked: Understood, hits: Sequence[Hit], encoders: Iterable[str]) -> str:
+    """The notes of the hits, each once, and the words that encoders without a hit do not know.
+
+    A note that holds for some hits only names their scenes.
+
+    Args:
+        asked: The phrase as it was parsed.
+        hits: The scenes that hold it, the best first.
+        encoders: Names of the encoders of all scenes.
+
+    Returns:
+        "" if everything was understood and found.
+    """
+    scenes: dict[str, list[str]] = {}
+    for hit in hits:
+        parts = hit.answer["note"].split("; ") if hit.answer["note"] else []
+        if hit.answer["understood"] != hits[0].answer["understood"]:
+            parts.append(f"understood as {shortened(hit.answer['understood'])}")
+        for part in dict.fromkeys(parts):
+            scenes.setdefault(part, []).append(hit.scene)
+    notes = [
+        part if len(named) == len(hits) else f"{part} (in {_listed(named)})" for part, named in scenes.items()
+    ]
+    if not hits and asked.note:
+        notes.append(asked.note)
+    answered = {hit.clip for hit in hits}
+    for clip in encoders if not asked.unknown else ():
+        if clip not in answered:
+            notes += _notes_without_hits(asked.phrase, clip, mended=not hits)
+    return "; ".join(dict.fromkeys(notes))
+
+
+def _notes_without_hits(phrase: Phrase, clip: str, mended: bool) -> Iterator[str]:
+    """Notes of an encoder without a hit.
+
+    Args:
+        phrase: What was asked for.
+        clip: Name of the encoder.
+        mended: Whether to note what was searched in place of typing errors.
+    """
+    known = words_of_things(clip)
+
+    def mend(thing: Thing) -> Phrase:
+        right = thing.text if thing.exact else corrected(thing.text, known)
+        return thing if right == thing.text else thing_of(right)
+
+    searched = with_things(phrase, mend)
+    if mended and searched != phrase:
+        yield f"also searched as {shortened(str(searched))}"
+    if note := unknown_note(searched, clip):
+        yield note
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _in_turn(possible: Candidates, limit: int) -> list[tuple[str, float]]:
