@@ -337,7 +337,8 @@ class LibraryTools(Tools):
         limit: Annotated[int, Field(description="Number of scenes, at most.", ge=1, le=50)] = 5,
     ) -> Annotated[Reply, answers.LibraryAnswer]:
         """Find which of many places hold a thing, and where in them; their names work in all other tools."""
-        assert self.library is not None
+        if self.library is None:
+            raise ValueError("there is no library")
         found = self.library.search(phrase, limit)
         if found.hits:
             listed = "; ".join(hit.without_note() for hit in found.hits)

@@ -134,7 +134,8 @@ def record_of(
         codes: Its codes.
         contents: Its segments and objects.
     """
-    assert scene.folder is not None
+    if scene.folder is None:
+        raise ValueError("a scene of a library has a folder")
     return Record(
         name=name,
         path=path,

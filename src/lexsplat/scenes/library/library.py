@@ -309,7 +309,8 @@ class Library:
         """`add` under a name, while the library is locked (`changing`)."""
         scene = open_scene(path, device=self._device)
         scene.listener, folder = self.listener, scene.folder
-        assert folder is not None
+        if folder is None:
+            raise ValueError("a scene that was opened has a folder")
         place = BUNDLED if folder.is_bundled else str(folder.root.resolve())
         name = name or self._name_for(place, state_of(folder))
         before = self.record(name)
