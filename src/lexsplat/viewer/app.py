@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any
 from urllib.parse import quote
 
@@ -12,10 +13,9 @@ from PIL import Image
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
-from lexsplat.captures.capture import Capture
 from lexsplat.pipeline.inputs import reload_capture
 from lexsplat.runtime.errors import BackendError, LexsplatError, QueryError
 from lexsplat.scenes.publishing.index import PAGE_FILES, folder_index, page_file
@@ -32,12 +32,11 @@ Work = Callable[[Session, dict[str, Any]], Response]
 
 def make_app(session: Session) -> Starlette:
     """The application; put a `lexsplat.viewer.guard.Guard` in front of it."""
-    photos = _Photos(session)
     return Starlette(
         routes=[
-            Route("/", lambda _: _text(folder_index(session.content.manifest), "text/html")),
+            Route("/", lambda _: HTMLResponse(folder_index(session.content.manifest))),
             Route("/manifest.json", lambda _: JSONResponse(session.content.manifest)),
-            Route("/photo/{number:int}", photos.answer),
+            Route("/photo/{number:int}", _photos(session)),
             _posted("/ask", session, lambda s, data: _bytes(s.ask(Asked.from_json(data)))),
             _posted("/click", session, lambda s, data: _bytes(s.what_is(Asked.from_json(data)))),
             _posted("/details", session, lambda s, data: JSONResponse(s.details(Asked.from_json(data)))),
@@ -95,37 +94,25 @@ def _file(session: Session, name: str) -> Response:
         return _bytes(files[name])
     if name in PAGE_FILES:
         return Response(page_file(name), media_type=_TYPES[name.rpartition(".")[2]])
-    return Response("not found\n", 404, media_type="text/plain")
+    return PlainTextResponse("not found\n", 404)
 
 
 def _bytes(content: bytes) -> Response:
     return Response(content, media_type="application/octet-stream")
 
 
-def _text(content: str, kind: str) -> Response:
-    return Response(content, media_type=kind)
+def _photos(session: Session) -> Callable[[Request], Awaitable[Response]]:
+    """The photos that the scene was built from, if they are still there, by their numbers in the manifest."""
+    capture = functools.cache(reload_capture)
 
-
-class _Photos:
-    """The photos that the scene was built from, if they are still there."""
-
-    def __init__(self, session: Session) -> None:
-        self._session = session
-        self._capture: Capture | None = None
-
-    async def answer(self, request: Request) -> Response:
-        """The photo of a view, by its number in the manifest."""
-        return await run_in_threadpool(self._photo, request.path_params["number"])
-
-    def _photo(self, number: int) -> Response:
+    def photo(number: int) -> Response:
         try:
-            views = self._session.content.manifest["views"]
-            folder = self._session.scene.folder
+            views = session.content.manifest["views"]
+            folder = session.scene.folder
             if folder is None or number >= len(views):
                 raise QueryError("photo", expected="a view of a scene folder", found="none")
-            with self._session.lock:
-                self._capture = self._capture or reload_capture(folder)
-            view = self._capture.views[views[number]["name"]]
+            with session.lock:
+                view = capture(folder).views[views[number]["name"]]
             shrink = min(1.0, _PHOTO_SIDE / max(view.camera.width, view.camera.height))
             size = (max(1, round(view.camera.width * shrink)), max(1, round(view.camera.height * shrink)))
             pixels = (view.load_image(size) * 255).round().astype("uint8")
@@ -135,3 +122,8 @@ class _Photos:
         except (LexsplatError, OSError) as error:
             known = error if isinstance(error, LexsplatError) else BackendError("photo", found=str(error))
             return Response(json.dumps(error_document(known)), 404, media_type="application/json")
+
+    async def answer(request: Request) -> Response:
+        return await run_in_threadpool(photo, request.path_params["number"])
+
+    return answer

@@ -40,9 +40,8 @@ COMPRESSED = {".compressed.ply": "compressed.ply", ".ksplat": "ksplat"}
 _CHUNK = 256
 _BARE = str.maketrans("", "", "{}")
 _KSPLAT_HEADER, _KSPLAT_SECTION = 4096, 1024
-_KSPLAT = struct.Struct(
-    "<4xIIIIH"
-)  # sections, those in use, and of Gaussians; number of Gaussians; compression level
+_KSPLAT = struct.Struct("<4xIIIIH")
+"""Sections, those in use, and of Gaussians; number of Gaussians; compression level."""
 _KSPLAT_PART = struct.Struct("<IIIIfHxxIIIIH")
 """Of a section: Gaussians, and how many there is space for; of buckets size, number, extent and bytes; range, bytes,
 full and partial buckets; degree of the harmonics."""

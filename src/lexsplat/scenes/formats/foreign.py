@@ -38,7 +38,7 @@ AROUND = 5
 AGAIN, EXPORT_AGAIN = "copy the file again or export it again", "export the file again"
 """The remedies for damage, and for content that copying cannot have changed."""
 
-_CAUSED = (
+_CAUSED: tuple[type[Exception], ...] = (
     ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, OSError,
     struct.error, zlib.error,
 )  # fmt: skip
@@ -82,9 +82,10 @@ def reason(error: Exception) -> str:
 @contextlib.contextmanager
 def parsing(path: Path, expected: str, *further: type[Exception]) -> Iterator[None]:
     """Errors that damaged content causes in this block, and ``further`` ones, as errors of the file."""
+    caused = _CAUSED + further
     try:
         yield
-    except (*_CAUSED, *further) as error:
+    except caused as error:
         raise damaged(path, expected, reason(error)) from error
 
 

@@ -13,6 +13,7 @@ the order of their bounds. Dimension letters: S scenes, K codes, D dimensions, P
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 
@@ -84,16 +85,11 @@ def phrase_bound(phrase: Phrase, of_thing: Mapping[str, FloatArray]) -> FloatArr
     A relation holds where all of its parts are present, a union where one is.
     """
     if isinstance(phrase, Thing):
-        lower = (
-            NO_SEGMENT / NO_PART if thing_of_part(phrase.text) else 1.0
-        )  # a part may be held from `NO_PART`
-        return lower * of_thing[phrase.text]
+        # A part may be held from `NO_PART`.
+        return (NO_SEGMENT / NO_PART if thing_of_part(phrase.text) else 1.0) * of_thing[phrase.text]
     if isinstance(phrase, (Anything, Viewer)):
         return CERTAIN
     parts = [phrase_bound(part, of_thing) for part in parts_of(phrase).values()]
     if isinstance(phrase, Except):
         return parts[0]
-    bound = parts[0]
-    for part in parts[1:]:
-        bound = np.maximum(bound, part) if isinstance(phrase, Both) else np.minimum(bound, part)
-    return bound
+    return functools.reduce(np.maximum if isinstance(phrase, Both) else np.minimum, parts)

@@ -274,10 +274,8 @@ def _points(scene: Scene, segments: Segments) -> dict[str, Tensor]:
     numbers = np.bincount(labels[order], minlength=count)
     first = np.cumsum(numbers) - numbers
     rank = np.arange(len(order)) - first[labels[order]]
-    step = -(-numbers // max(_POINTS, _ALL_POINTS // count))[
-        labels[order]
-    ]  # every second or third of them, and so on
-    chosen = order[rank % np.maximum(step, 1) == 0]
+    steps = -(-numbers // max(_POINTS, _ALL_POINTS // count))  # every second or third of them, and so on
+    chosen = order[rank % np.maximum(steps[labels[order]], 1) == 0]
     gaussians = scene.gaussians.select(torch.from_numpy(chosen).to(scene.gaussians.means.device)).detach()
     means, rotations = gaussians.means.cpu(), matrices_from_quaternions(gaussians.quats)
     spreads = ((rotations * gaussians.scales[:, None]) @ rotations.transpose(1, 2)).cpu()

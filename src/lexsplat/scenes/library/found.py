@@ -60,10 +60,8 @@ class Hit:
         return f"{self.scene}: present: {self.present}. {text}{self._sizes()}"
 
     def _sizes(self) -> str:
-        scale, unit = (
-            (self.world.meters_per_unit or 1.0),
-            "m" if self.world.meters_per_unit else "scene units",
-        )
+        meters = self.world.meters_per_unit
+        scale, unit = (meters, "m") if meters else (1.0, "scene units")
         sizes = [each["size"] for each in self.answer["instances"][:8]]
         listed = "; ".join(" x ".join(f"{side * scale:.2f}" for side in size) for size in sizes)
         return f" Size: {listed} {unit}." if listed else ""
