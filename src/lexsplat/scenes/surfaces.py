@@ -123,8 +123,6 @@ class Orthophoto(NamedTuple):
         cells: Places of the pixels in the two vectors of the plane ``[P, P, 2]``.
         size: Width of a pixel, world units.
         colors: RGB ``[P, P, 3]``, divided by the coverage.
-        coverage: Share of each pixel that Gaussians cover ``[P, P]``.
-        heights: Mean height above the plane ``[P, P]``, world units.
         shown: Share of the views that see the surface there ``[P, P]``.
         covered: Share of the views that have the thing before it ``[P, P]``.
     """
@@ -132,8 +130,6 @@ class Orthophoto(NamedTuple):
     cells: FloatArray
     size: float
     colors: FloatArray
-    coverage: FloatArray
-    heights: FloatArray
     shown: FloatArray
     covered: FloatArray
 
@@ -151,20 +147,18 @@ def photographed(
         cameras: The views that the scene was made from; without any, the surface is shown everywhere.
     """
     cells, size = _cells(surface, cameras)
-    colors, coverage, heights = from_above(gaussians, surface, members, cells)
+    colors, coverage, _ = from_above(gaussians, surface, members, cells)
     places = (surface.origin + cells @ surface.axes[:2]).reshape(-1, 3)
     shown, covered, seen = looked_up(gaussians, gone, places, cameras, THICK * surface.radius)
     shape = cells.shape[:2]
     shown, covered, seen = shown.reshape(shape), covered.reshape(shape), seen.reshape(colors.shape)
-    if not cameras:
-        return Orthophoto(cells, size, colors, coverage, heights, np.ones_like(shown), covered)
     known = (coverage > 0.5) & (shown > 0)
     width = surface.radius / size / 2
     gain = np.ones(3)
     if known.any():
         there, drawn = (mean_around(image, known.astype(float), width, 4.0) for image in (seen, colors))
         gain = (there / np.maximum(drawn, 0.02)).clip(0.5, 2)
-    return Orthophoto(cells, size, colors * gain, coverage, heights, shown, covered)
+    return Orthophoto(cells, size, colors * gain, shown if cameras else np.ones_like(shown), covered)
 
 
 def looked_up(
