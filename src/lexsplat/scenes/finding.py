@@ -50,9 +50,9 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
         return thing
 
     found = with_things(understood.phrase, mend)
-    notes = [*filter(None, (understood.note, mended_note(mended)))]
     unknown = unknown_note(found, scene.clip)
-    return Understood(found, "; ".join(filter(None, (*notes, unknown))), unknown=bool(unknown))
+    notes = (understood.note, mended_note(mended), unknown)
+    return Understood(found, "; ".join(filter(None, notes)), unknown=bool(unknown))
 
 
 def _tokens_over(scene: Scene, text: str) -> int:

@@ -42,6 +42,7 @@ _CAUSED: tuple[type[Exception], ...] = (
     ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, OSError,
     struct.error, zlib.error,
 )  # fmt: skip
+"""Errors that damaged content causes."""
 _logged: ContextVar[set[str] | None] = ContextVar("logged", default=None)
 _LARGEST_LOGIT = 20.0
 _COARSE = 0.1

@@ -46,12 +46,8 @@ def write_labels_csv(
             )
 
 
-def write_points_ply(gaussians: Gaussians, path: Path) -> int:
-    """Write a colored point cloud (x, y, z, red, green, blue): one point per Gaussian of opacity 0.1 or more.
-
-    Returns:
-        Number of points.
-    """
+def write_points_ply(gaussians: Gaussians, path: Path) -> None:
+    """Write a colored point cloud (x, y, z, red, green, blue): one point per Gaussian of opacity 0.1 or more."""
     shown = gaussians.select((gaussians.opacities >= 0.1).detach())
     layout = [("place", "<f4", 3), ("color", "u1", 3)]
     table = np.zeros(len(shown), dtype=layout)
@@ -62,4 +58,3 @@ def write_points_ply(gaussians: Gaussians, path: Path) -> int:
     with open(path, "wb") as file:
         file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
         file.write(table.tobytes())
-    return len(shown)

@@ -53,10 +53,7 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
     return {
         "weights": weights.name,
         "tokenizer": tokenizer.name,
-        "heads": tower.heads,
-        "activation": tower.activation,
-        "epsilon": tower.epsilon,
-        "padding": tower.padding,
+        **{name: getattr(tower, name) for name in ("heads", "activation", "epsilon", "padding")},
         "templates": list(scene.query.templates),
         "everyday": {
             **constants_of(everyday, "BORDER", "STEEPNESS", "OFFSET", "PEAK_SHARE"),
