@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -89,16 +90,13 @@ def export_gaussians(
         )
     writers: dict[str, Callable[[Path], object]] = {
         ".ply": lambda file: write_ply(gaussians, file, further=ply_columns(language) if language else None),
-        ".points.ply": lambda file: write_points_ply(gaussians, file),
-        ".splat": lambda file: write_splat(gaussians, file),
-        ".spz": lambda file: write_spz(gaussians, file),
-        ".v3.spz": lambda file: write_spz(gaussians, file, version=3),
-        ".sog": lambda file: write_sog(gaussians, file),
-        ".glb": lambda file: write_glb(gaussians, file, language=language, world=world),
-    }
-    writers |= {
-        name: lambda file, kind=kind: write_compressed(gaussians, file, kind)  # type: ignore[misc]
-        for name, kind in COMPRESSED.items()
+        ".points.ply": partial(write_points_ply, gaussians),
+        ".splat": partial(write_splat, gaussians),
+        ".spz": partial(write_spz, gaussians),
+        ".v3.spz": partial(write_spz, gaussians, version=3),
+        ".sog": partial(write_sog, gaussians),
+        ".glb": partial(write_glb, gaussians, language=language, world=world),
+        **{name: partial(write_compressed, gaussians, kind=kind) for name, kind in COMPRESSED.items()},
     }
     written = [path]
     if language is not None and ending == ".ply":
