@@ -216,7 +216,7 @@ def measured(library: Library) -> dict[str, Any]:
 def compared(library: Library, served: Library) -> dict[str, Any]:
     """Rate of uploading, time of a search through the server, and its recall at ten."""
     start = time.perf_counter()
-    with served._changing():
+    with served.changing():
         entries = [(record, codes) for record in served.records() if (codes := served.codes(record))]
         served.server.repair(entries, served.stage)
     seconds = time.perf_counter() - start

@@ -200,6 +200,17 @@ def test_entries_of_a_library_without_segments_answer_by_their_scenes(segmented_
     assert (hit.scene, hit.source) == ("kitchen", "scene")
 
 
+def test_a_scene_that_was_built_as_in_the_paper_is_asked_as_when_it_is_opened(tmp_path):
+    room = write_scene(tmp_path / "room", segments=True)
+    record = read_json(room / "scene.json")
+    write_json(room / "scene.json", {**record, "config": {**record["config"], "as_in_paper": True}})
+    library = Library.create(tmp_path / "library")
+    library.add(room)
+    assert library.scene("room").query == open_scene(room, device="cpu").query
+    (hit,) = library.search("mug").hits
+    assert hit.source == "scene", "what is kept would be asked by segments"
+
+
 # -- damage
 
 

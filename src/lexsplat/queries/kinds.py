@@ -34,7 +34,7 @@ _SHOWN = 40
 
 def words_of_things(clip: str) -> list[str]:
     """Names of things, their qualities and their kinds: what a misspelled word may mean, for an encoder."""
-    return [*default_vocabulary(clip), *QUALITIES, *KINDS]
+    return [*default_vocabulary(clip), *sorted(QUALITIES), *KINDS]
 
 
 def is_kind(text: str) -> bool:

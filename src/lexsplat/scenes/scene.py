@@ -26,7 +26,7 @@ from lexsplat.geometry.world import World, world_of
 from lexsplat.language.fields import LanguageField
 from lexsplat.queries.everyday import EverydayScale, everyday_words
 from lexsplat.queries.phrases import Understood
-from lexsplat.queries.picking import select_hit, surface_at
+from lexsplat.queries.picking import Hit, select_hit, surface_at
 from lexsplat.queries.presence import PresenceClassifier
 from lexsplat.queries.relevancy import (
     QueryConfig,
@@ -336,7 +336,10 @@ class Scene:
         Raises:
             QueryError: If the pixel lies outside the image or shows nothing, or the view is unknown.
         """
-        hit = surface_at(self.gaussians, self.camera(view), x, y)
+        return self.select_hit(surface_at(self.gaussians, self.camera(view), x, y))
+
+    def select_hit(self, hit: Hit) -> Selection:
+        """The object at a surface that was clicked."""
         return replace(select_hit(hit, self.gaussians, self.field, self.cameras, self.world), seen=self.seen)
 
     @property

@@ -19,7 +19,7 @@ from torch import Tensor
 from lexsplat.geometry.rotations import rotation_about
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.phrases import Thing
-from lexsplat.queries.picking import Hit, select_hit, surface_at
+from lexsplat.queries.picking import Hit, surface_at
 from lexsplat.queries.relevancy import probability_relevancy
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
@@ -172,7 +172,7 @@ class Session:
     def _select(self, asked: Asked) -> Selection:
         scene = self.scene
         if asked.click is not None:
-            return select_hit(self._hit(asked), scene.gaussians, scene.field, scene.cameras, scene.world)
+            return scene.select_hit(self._hit(asked))
         plain = isinstance(scene.understand(asked.prompt).phrase, Thing)  # the scene keeps those answers
         return scene.find(asked.prompt, None if plain else asked.camera, threshold=asked.threshold)
 

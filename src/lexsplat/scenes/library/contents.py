@@ -28,6 +28,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.rotations import matrices_from_quaternions
 from lexsplat.language.segment_codes import segment_codes
 from lexsplat.language.segments import Segments
+from lexsplat.queries.relevancy import QueryConfig
 from lexsplat.rendering import render
 from lexsplat.runtime.device import one_thread
 from lexsplat.runtime.fingerprints import digest
@@ -151,12 +152,16 @@ class Contents:
     @torch.no_grad()
     @one_thread()
     def of(cls, scene: Scene) -> Contents | None:
-        """What is kept of a scene; None if it has no segments.
+        """What is kept of a scene; None if it has no segments or is asked otherwise, such as in the paper's form.
 
         Raises:
             ModelError: If the everyday words are new to its folder and its encoder cannot be loaded.
         """
-        if scene.field.segments is None or scene.presence_classifier.segment_codes is None:
+        if (
+            scene.field.segments is None
+            or scene.query != QueryConfig()
+            or scene.presence_classifier.segment_codes is None
+        ):
             return None
         segments = _kept_levels(scene.field.segments)
         points = _points(scene, segments)

@@ -231,7 +231,8 @@ class Library:
         clip = found.folder.record.get("config", {}).get("clip", "bundled")
         known = found.folder.record["stages"].get("features", {}).get("clip_hash", "")
         encode = functools.partial(self.encode, known, clip)
-        return Scene(found.gaussians, found.field, found.views, clip, folder=found.folder, encode_text=encode)
+        content = (found.gaussians, found.field, found.views, clip, found.query, found.folder)
+        return Scene(*content, encode_text=encode)
 
     # -- text
 
