@@ -8,7 +8,14 @@ from support.question_scene import coded_cloud, texts
 from lexsplat.language.segments import Segments
 from lexsplat.queries.relevancy import QueryConfig, Question, gaussian_relevancy
 from lexsplat.queries.scoring import form_used, render_gaussian_scores, scores_in_form
-from lexsplat.queries.segments import SEGMENT_THRESHOLD, segment_relevancy
+from lexsplat.queries.segments import (
+    LOWEST,
+    MOST_CERTAIN,
+    OWN_SHARE,
+    SEGMENT_THRESHOLD,
+    STEEPNESS,
+    segment_relevancy,
+)
 from lexsplat.rendering import render
 
 # A mug of body (segments 0, 1) and handle (2), a table (3, 4) and a wall (5); 4 Gaussians each.
@@ -54,6 +61,52 @@ def test_unseen_gaussians_follow_but_have_no_say():
     own = torch.tensor([0.9, 0.0, 0.0, 0.0] + [0.1] * 20)[None]
     segments = Segments(LABELS, masses, LEVELS[:1])
     assert (segment_relevancy(own, segments) >= SEGMENT_THRESHOLD)[0].tolist() == [True] * 4 + [False] * 20
+
+
+def test_of_equal_gaussians_the_one_whose_views_agree_scores_higher_and_the_same_segments_are_taken():
+    # As the edge of a cloth beside a ring: its crops show the ring, but not all of them.
+    own = torch.tensor([0.9] * 12 + [0.1] * 12)[None]
+    uncertainties = torch.full((24,), 0.1)
+    uncertainties[[0, 13]] = 0.4
+    segments = Segments(LABELS, torch.ones(24), LEVELS)
+    found, alike = segment_relevancy(own, segments, uncertainties)[0], segment_relevancy(own, segments)[0]
+    assert found[0] < found[1:12].min()
+    assert found[13] < found[12]
+    assert torch.equal(found >= SEGMENT_THRESHOLD, alike >= SEGMENT_THRESHOLD)
+    assert torch.equal(segment_relevancy(own, segments, torch.full((24,), 0.5))[0], alike), (
+        "only differences count"
+    )
+    nothing = segment_relevancy(own, segments, torch.ones(24))[0]
+    assert torch.isfinite(nothing).all()
+
+
+def test_scores_are_those_of_a_loop_over_gaussians():
+    generator = np.random.default_rng(5)
+    own, masses, u = generator.random(24), generator.random(24), generator.random(24)
+    means = [np.average(own[k == LABELS], weights=masses[k == LABELS]) for k in range(6)]
+    ranked = sorted(means, reverse=True)
+    limit = max((a - b, (a + b) / 2) for a, b in itertools.pairwise(ranked) if a >= LOWEST * ranked[0])[1]
+    inside = np.array([means[label] >= limit for label in LABELS])
+    gap = np.average(own[inside], weights=masses[inside]) - np.average(own[~inside], weights=masses[~inside])
+    usual = np.average(1 - u[inside], weights=masses[inside])
+    expected = []
+    for n in range(24):
+        certainty = min((1 - u[n]) / usual, MOST_CERTAIN)
+        odds = OWN_SHARE * own[n] * certainty + (1 - OWN_SHARE) * means[LABELS[n]] - limit
+        expected.append(0.5 * inside[n] + 0.5 / (1 + np.exp(-STEEPNESS * odds / gap)))
+    segments = Segments(LABELS, torch.from_numpy(masses).float(), LEVELS[:1])
+    found = segment_relevancy(torch.from_numpy(own)[None], segments, torch.from_numpy(u))[0]
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-5)
+
+
+def test_no_gaussian_of_a_segment_that_is_left_reaches_the_threshold():
+    own = torch.full((1, 24), 0.05)
+    own[0, :4] = 0.06
+    own[0, 23] = 1.0  # one of a hundred in its segment, so that its segment is left
+    masses = torch.ones(24)
+    masses[23] = 1e-3
+    found = segment_relevancy(own, Segments(LABELS, masses, LEVELS[:1]))[0]
+    assert (found >= SEGMENT_THRESHOLD).tolist() == [True] * 4 + [False] * 20
 
 
 def test_scores_stay_in_range_and_do_not_depend_on_the_other_prompts():

@@ -19,6 +19,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.picking import surface_at
 from lexsplat.scenes.publishing import PublishOptions, publish, splat_file, vocabulary
 from lexsplat.scenes.publishing.manifest import checksums
+from lexsplat.scenes.publishing.sidecar import segment_rule
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
 
@@ -354,19 +355,19 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(bro
         (lambda m: m.update(language=None), "language or a server"),
         (
             lambda m: m["language"].update(segments="s", segment_rule=None),
-            "5 numbers in language.segment_rule",
+            "7 numbers in language.segment_rule",
         ),
         (
             lambda m: m["language"].update(
                 segments="s",
-                segment_rule=dict.fromkeys(("lowest", "border", "own_share", "steepness", "threshold"), 1),
+                segment_rule=dict.fromkeys(segment_rule(), 1),
             ),
             "18 numbers in language.part_rule",
         ),
         (lambda m: m["selection_rule"].pop("link"), "11 numbers in selection_rule"),
         (lambda m: m.pop("grammar"), "an object in grammar"),
         (lambda m: m["files"].pop("scene.ply"), "scene.ply in files"),
-        (lambda m: m.clear(), "version 6 of a lexsplat page"),
+        (lambda m: m.clear(), "version 7 of a lexsplat page"),
     ],
 )
 def test_a_manifest_that_lacks_a_field_is_refused_by_its_name(browser, ball_page, change, told):

@@ -77,6 +77,10 @@ export interface SegmentRule {
   /** Share of a splat's own relevancy in its score; the rest is its segment's. */
   own_share: number;
   steepness: number;
+  /** Largest factor of an own relevancy for the agreement of the views. */
+  most_certain: number;
+  /** Factor that keeps the scores of segments that are left below the threshold in single precision. */
+  below: number;
   /** Smallest score of a splat in a taken segment. */
   threshold: number;
 }
@@ -198,7 +202,7 @@ export interface Manifest {
   provenance: Record<string, unknown>;
 }
 
-const FORMAT_VERSION = 6;
+const FORMAT_VERSION = 7;
 
 const isText = (value: unknown): boolean => typeof value === "string";
 const isRecord = (value: unknown): boolean => typeof value === "object" && value !== null && !Array.isArray(value);
@@ -234,7 +238,7 @@ const FIELDS: [string, string, (value: unknown) => boolean][] = [
   ["views", "a list of cameras", areViews],
 ];
 
-const SEGMENT_RULE = ["lowest", "border", "own_share", "steepness", "threshold"];
+const SEGMENT_RULE = ["lowest", "border", "own_share", "steepness", "most_certain", "below", "threshold"];
 const PART_RULE = [
   "fewest", "neighbors", "color", "score", "rounds", "shared", "best", "lowest", "mostly", "all", "usual", "spread", "first", "last",
   "steps", "near", "few", "outside",

@@ -20,17 +20,19 @@ export class Segments {
   /** Segment at each level of each lowest segment, the lowest level first. */
   readonly #levels: Uint32Array[];
   readonly #sums: Float64Array;
+  /** 1 - u_G of each splat: low where the views disagree. */
+  readonly #certainties: Float32Array;
   /** 1 for each splat that no view shows; selections leave it out. */
   readonly hidden: Uint8Array;
 
-  /** `content` is L and S, the levels [L, S], the labels [N], the masses [N] and `hidden` [N] (lexsplat.scenes.publishing.sidecar). */
+  /** `content` is L and S, the levels [L, S], the labels [N], the masses [N], u_G [N] and `hidden` [N] (lexsplat.scenes.publishing.sidecar). */
   constructor(content: Uint8Array<ArrayBuffer>, count: number, readonly rule: SegmentRule) {
     const view = new DataView(content.buffer, content.byteOffset, content.byteLength);
     const levels = view.getUint32(0, true);
     const segments = view.getUint32(4, true);
     const wide = segments > 65536;
     let at = 8;
-    if (content.length !== at + 4 * levels * segments + count * ((wide ? 4 : 2) + 3)) {
+    if (content.length !== at + 4 * levels * segments + count * ((wide ? 4 : 2) + 4)) {
       throw new PageError("segments.bin: its length does not fit the scene; publish the scene again.");
     }
     const read = (length: number, bytes: number): ArrayBuffer => {
@@ -40,6 +42,7 @@ export class Segments {
     this.#levels = Array.from({ length: levels }, () => new Uint32Array(read(segments, 4)));
     this.labels = wide ? new Uint32Array(read(count, 4)) : new Uint16Array(read(count, 2));
     this.masses = Float64Array.from(new Uint16Array(read(count, 2)), (half) => DataUtils.fromHalfFloat(half));
+    this.#certainties = Float32Array.from(new Uint8Array(read(count, 1)), (u) => 1 - u / 255);
     this.hidden = content.slice(at);
     this.#sums = new Float64Array(segments);
     this.labels.forEach((label, i) => (this.#sums[label] += this.masses[i]));
@@ -81,16 +84,26 @@ export class Segments {
       if (best === null || before(best.cut, cut, this.rule.border)) best = { cut, level };
     }
     const { cut, level } = best!;
-    const { own_share: share, steepness, threshold } = this.rule;
+    const { own_share: share, steepness, threshold, most_certain: most, below } = this.rule;
     const spread = Math.max(cut.taken - cut.left, 1e-6);
     // What all splats of a lowest segment share is computed once: a scene has millions of splats.
     const slope = steepness / spread;
     const shared = lowest.map((_, label) => ((1 - share) * cut.scores[level[label]] - cut.limit) * slope);
     const floor = lowest.map((_, label) => threshold * Number(cut.scores[level[label]] >= cut.limit));
+    // The own relevancy of a splat counts by how certain it is beside what is taken.
+    let mass = 0;
+    let certain = 0;
+    for (let i = 0; i < own.length; i++) {
+      if (!floor[labels[i]]) continue;
+      mass += masses[i];
+      certain += masses[i] * this.#certainties[i];
+    }
+    const usual = Math.max(certain / Math.max(mass, 1e-12), 1e-6);
     const scores = new Float32Array(own.length);
     for (let i = 0; i < own.length; i++) {
-      const odds = Math.min(60, Math.max(-60, own[i] * share * slope + shared[labels[i]]));
-      scores[i] = floor[labels[i]] + (1 - threshold) / (1 + Math.exp(-odds));
+      const counted = own[i] * share * Math.min(this.#certainties[i] / usual, most);
+      const odds = Math.min(60, Math.max(-60, counted * slope + shared[labels[i]]));
+      scores[i] = floor[labels[i]] + (below * (1 - threshold)) / (1 + Math.exp(-odds));
     }
     return scores;
   }

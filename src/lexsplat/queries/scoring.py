@@ -39,7 +39,7 @@ def scores_in_form(
     if field.segments is None or query.form != "segment" or not held:
         return relevancy
     scores = relevancy.clone()
-    scores[held] = segment_relevancy(relevancy[held], field.segments)
+    scores[held] = segment_relevancy(relevancy[held], field.segments, field.uncertainties)
     return scores
 
 

@@ -8,8 +8,10 @@ parts score alike, and its handle alone where only the handle scores high. As lo
 than the rest, such as the whole mug for "mug handle".
 
 The result is a score in 0..1 for each Gaussian. It is at least 0.5 exactly for Gaussians of taken segments, so the
-threshold of masks and of selections is 0.5 for every prompt. Dimension letters: P prompts, N Gaussians, L levels,
-S segments.
+threshold of masks and of selections is 0.5 for every prompt. On both sides a Gaussian's own relevancy decides. It
+counts less where the views disagree (u_G), since crops of what lies beside a thing show the thing, too.
+
+Dimension letters: P prompts, N Gaussians, L levels, S segments.
 """
 
 from __future__ import annotations
@@ -34,6 +36,10 @@ OWN_SHARE = 0.7
 """Share of a Gaussian's own relevancy in its score; the rest is its segment's."""
 STEEPNESS = 8.0
 """Slope of the score at the cut, relative to the gap between taken and other segments."""
+MOST_CERTAIN = 2.0
+"""Largest factor of an own relevancy for the agreement of the views."""
+BELOW = 1 - 2.0**-20
+"""Factor that keeps the largest score of a segment that is left below `SEGMENT_THRESHOLD` in single precision."""
 
 FloatArray = NDArray[np.float64]
 
@@ -60,12 +66,14 @@ class _Cut:
 
 
 @torch.no_grad()
-def segment_relevancy(relevancy: Tensor, segments: Segments) -> Tensor:
+def segment_relevancy(relevancy: Tensor, segments: Segments, uncertainties: Tensor | None = None) -> Tensor:
     """Segment-aware scores from relevancies of Gaussians.
 
     Args:
         relevancy: ``[P, N]`` in 0..1.
         segments: The segments of the N Gaussians.
+        uncertainties: u_G of the Gaussians ``[N]`` in 0..1. The own relevancy of a Gaussian is multiplied by 1 - u,
+            relative to the mean of what is taken (at most `MOST_CERTAIN`). None counts all alike.
 
     Returns:
         ``[P, N]`` in 0..1, on the device of ``relevancy``; at least `SEGMENT_THRESHOLD` exactly where a segment is
@@ -78,6 +86,8 @@ def segment_relevancy(relevancy: Tensor, segments: Segments) -> Tensor:
     levels = segments.levels.cpu().numpy()
     lowest = np.stack([_sums(labels, weights * row, levels.shape[1]) for row in own])
     masses = _sums(labels, weights, levels.shape[1])
+    certainties = None if uncertainties is None else 1 - uncertainties.detach().cpu().float().numpy()
+    certain = masses if certainties is None else _sums(labels, weights * certainties, levels.shape[1])
     cuts = [_cut(lowest, masses, level) for level in levels]
     result = np.empty_like(own)
     for prompt in range(len(own)):
@@ -87,14 +97,18 @@ def segment_relevancy(relevancy: Tensor, segments: Segments) -> Tensor:
         cut = cuts[place]
         at_lowest = cut.scores[prompt][levels[place]]
         limit, spread = cut.limits[prompt], max(cut.taken[prompt] - cut.left[prompt], 1e-6)
+        taken = at_lowest >= limit
         # Single precision, in place: this is all that is done for each Gaussian.
-        odds = ((1 - OWN_SHARE) * at_lowest - limit).astype(np.float32)[labels]
-        odds += np.float32(OWN_SHARE) * own[prompt]
+        odds = own[prompt] * np.float32(OWN_SHARE)
+        if certainties is not None:
+            usual = certain[taken].sum() / max(masses[taken].sum(), 1e-12)
+            odds *= np.minimum(certainties / np.float32(max(usual, 1e-6)), np.float32(MOST_CERTAIN))
+        odds += ((1 - OWN_SHARE) * at_lowest - limit).astype(np.float32)[labels]
         odds *= np.float32(-STEEPNESS / spread)
         steep = np.exp(np.clip(odds, -60, 60, out=odds), out=odds)
         steep += 1
-        np.divide(np.float32(1 - SEGMENT_THRESHOLD), steep, out=result[prompt])
-        result[prompt] += np.where(at_lowest >= limit, SEGMENT_THRESHOLD, 0.0).astype(np.float32)[labels]
+        np.divide(np.float32(BELOW * (1 - SEGMENT_THRESHOLD)), steep, out=result[prompt])
+        result[prompt] += np.where(taken, SEGMENT_THRESHOLD, 0.0).astype(np.float32)[labels]
     return torch.from_numpy(result).to(relevancy)
 
 

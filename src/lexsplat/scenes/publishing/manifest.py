@@ -19,7 +19,7 @@ from lexsplat.scenes.publishing.grammar import page_grammar
 from lexsplat.scenes.publishing.sidecar import selection_rule
 from lexsplat.scenes.scene import Scene
 
-FORMAT, FORMAT_VERSION = "lexsplat-page", 6
+FORMAT, FORMAT_VERSION = "lexsplat-page", 7
 DRAWN_SPLATS = 1_000_000
 """Gaussians that a page draws at once, at most; of more, those that cover most of the image."""
 MOST_OBJECTS = 200

@@ -34,7 +34,7 @@ def splat_codes(language: StoredLanguage) -> bytes:
 
 def segment_rule() -> dict[str, float]:
     """The constants by which the page takes or leaves segments: those of `lexsplat.queries.segments`."""
-    named = constants_of(rule, "LOWEST", "BORDER", "OWN_SHARE", "STEEPNESS")
+    named = constants_of(rule, "LOWEST", "BORDER", "OWN_SHARE", "STEEPNESS", "MOST_CERTAIN", "BELOW")
     return {**named, "threshold": rule.SEGMENT_THRESHOLD}
 
 
@@ -68,19 +68,21 @@ def constants_of(module: ModuleType, *names: str) -> dict[str, float]:
     return {name.lower(): getattr(module, name) for name in names}
 
 
-def segments_file(segments: Segments, hidden: torch.Tensor) -> bytes:
-    """The segments of N splats, little-endian: the numbers of levels L and of segments S, then four arrays.
+def segments_file(segments: Segments, uncertainties: torch.Tensor, hidden: torch.Tensor) -> bytes:
+    """The segments of N splats, little-endian: the numbers of levels L and of segments S, then five arrays.
 
     They are the segment at each level of each lowest segment ``[L, S]`` uint32; the lowest segment of each splat
-    ``[N]`` uint16, or uint32 for more than 65,536 segments; the masses ``[N]`` float16, as the scene stores them; and
-    1 for each splat that no view shows, which selections leave out, ``[N]`` uint8.
+    ``[N]`` uint16, or uint32 for more than 65,536 segments; the masses ``[N]`` float16, as the scene stores them;
+    u_G in 255ths ``[N]`` uint8, as in the scene; and 1 for each splat that no view shows, which selections leave out,
+    ``[N]`` uint8.
     """
     levels = segments.levels.cpu().numpy().astype("<u4")
     labels = segments.labels.cpu().numpy().astype("<u2" if levels.shape[1] <= 1 << 16 else "<u4")
     masses = segments.masses.clamp(max=6e4).cpu().numpy().astype("<f2")
+    uncertain = (uncertainties.cpu() * 255).round().numpy().astype(np.uint8)
     unseen = hidden.cpu().numpy().astype(np.uint8)
     head = np.array(levels.shape, "<u4")
-    return b"".join(array.tobytes() for array in (head, levels, labels, masses, unseen))
+    return b"".join(array.tobytes() for array in (head, levels, labels, masses, uncertain, unseen))
 
 
 def objects_file(objects: Sequence[Selection], kept: torch.Tensor) -> bytes:

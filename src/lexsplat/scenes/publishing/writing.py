@@ -207,7 +207,8 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     (folder / "codes.bin").write_bytes(splat_codes(language))
     segments = scene.field.segments if form_used(scene.field, scene.query) == "segment" else None
     if segments is not None:
-        (folder / "segments.bin").write_bytes(segments_file(segments.select(kept), scene.hidden.cpu()[kept]))
+        content = segments_file(segments.select(kept), language.uncertainties, scene.hidden.cpu()[kept])
+        (folder / "segments.bin").write_bytes(content)
     scene.listener(Event(_STAGE, 2, _STEPS))
     objects = scene.objects[:MOST_OBJECTS]
     (folder / "objects.bin").write_bytes(objects_file(objects, kept))
