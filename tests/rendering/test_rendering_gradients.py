@@ -87,17 +87,18 @@ def test_gradients_of_clamped_alpha_equal_the_float64_reference(antialiased):
         assert relative_error(getattr(gaussians, name).grad, leaves[name].grad) < 1e-4, name
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("seed", range(4))
-def test_gradients_behind_a_nearly_opaque_gaussian_are_as_exact_as_all_others(seed):
+def test_gradients_behind_a_nearly_opaque_gaussian_are_as_exact_as_all_others(seed, antialiased):
     # The first Gaussian covers the image with alpha 0.999; all others share what it lets pass.
-    gaussians, camera = random_gaussians(60, seed, scale=0.3), front_camera()
+    gaussians, camera = random_gaussians(60, seed, scale=0.3, antialiased=antialiased), front_camera()
     gaussians.means[0] = 0.7 * torch.from_numpy(camera.position).float()
     gaussians.opacity_logits[0] = 12.0
     gaussians.log_scales[0] = 3.0
     gaussians.sh0[0] = 3.0
     gaussians = with_gradients(gaussians)
     leaves = reference.to_float64(gaussians)
-    expected = reference.render(leaves, camera, antialiased=False, degree=3)
+    expected = reference.render(leaves, camera, antialiased=antialiased, degree=3)
     assert float(expected["alpha"].detach().min()) > 0.99899
     differentiate(render(gaussians, camera), expected)
     for name in FIELDS:

@@ -73,7 +73,7 @@ class BuildConfig:
             object; by default what they seem to be.
         method: "averaged" puts the features of all views on each Gaussian and quantizes them there (the best in
             docs/results.md); "trained" is the optimization of the paper.
-        joint: Train language together with geometry, as the authors' code does; needs method "trained".
+        joint: Train language together with geometry, as in the paper; needs method "trained".
         as_in_paper: Build and ask as the paper describes it (docs/paper.md): method "trained", jointly, 30,000 steps
             over full maps, random crops, rasterization without the mip filter, prompts relative to canonical phrases
             with a fixed threshold. Settings that are given otherwise are kept.
