@@ -107,6 +107,36 @@ def test_the_naive_port_learns(monkeypatch):
     assert np.mean(losses[24:]) < 0.9 * np.mean(losses[:24])
 
 
+def test_trainings_in_slices_start_from_the_points_of_a_build(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import training_slices
+
+    from lexsplat import reconstruction
+    from lexsplat.captures import load_capture
+    from lexsplat.evaluation.demo import demo_capture
+
+    capture, started = load_capture(demo_capture("second")), []
+
+    class Started(Exception):
+        pass
+
+    def start(capture, config, points, **options):
+        started.append(points)
+        raise Started
+
+    monkeypatch.setattr(reconstruction, "Reconstructor", start)
+    with pytest.raises(Started):
+        reconstruction.reconstruct(capture, reconstruction.ReconstructionConfig(iterations=1), seed=3)
+    points = training_slices.starting_points(capture, 3)
+    assert len(points.points) > len(capture.points)  # 24 photos are few
+    assert np.array_equal(points.points, started[0].points)
+    assert np.array_equal(points.colors, started[0].colors)
+    # Commits before the module have no points to add.
+    monkeypatch.setitem(sys.modules, "lexsplat.reconstruction.few_photos", None)
+    earlier = runpy.run_path(training_slices.__file__)["starting_points"]
+    assert np.array_equal(earlier(capture, 3).points, capture.points)
+
+
 def test_a_project_for_opensplat_holds_the_training_views_and_points(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
     import opensplat
