@@ -6,6 +6,7 @@ import runpy
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -217,7 +218,33 @@ def test_operations_of_an_encoder_are_those_of_its_matrix_products(monkeypatch):
     with torch.inference_mode(), features.Products() as products:
         layer(torch.rand(2, 3, 8, 8))
     # The convolution has 2 x 4 outputs of 48 inputs, the linear layer 2 x 8 rows.
-    assert dict(products.sizes) == {(1, 8, 48, 8): 1, (1, 16, 4, 5): 1}
+    assert dict(products.counts) == {(1, 8, 48, 8, torch.float32): 1, (1, 16, 4, 5, torch.float32): 1}
+    assert sum(product.operations for product in products.counts) == 2 * (8 * 48 * 8 + 16 * 4 * 5)
+
+
+def test_encoders_are_measured_with_the_settings_and_in_the_precision_of_a_build(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import features
+    from torch.utils.flop_counter import FlopCounterMode
+
+    from lexsplat.features.clip import DEFAULT_CLIP
+    from lexsplat.pipeline.config import BuildConfig
+
+    monkeypatch.setattr(features, "vit_b16_tower", lambda: SimpleNamespace(patches=14))
+    monkeypatch.setattr("lexsplat.pipeline.config.patch_grid", lambda name: 14)
+    bundled, vision = features.cases()
+    for case, clip in ((bundled, "bundled"), (vision, DEFAULT_CLIP)):
+        assert case.config == BuildConfig(clip=clip).resolved("cpu", (640, 480)).features
+        assert case.config.tokens == "both"
+    monkeypatch.setattr(features, "cases", lambda: [bundled])
+    monkeypatch.setattr(features, "cpu_batch", lambda side: 2)
+    for faster, expected in ((True, ["bfloat16", "float32"]), (False, ["float32"])):
+        monkeypatch.setattr(features.pretrained, "bfloat16_is_faster", lambda faster=faster: faster)
+        rows = features.run_encoders(1)
+        assert [row["precision"] for row in rows] == expected
+        with torch.inference_mode(), FlopCounterMode(display=False) as counter:
+            bundled.encode(torch.rand(2, 3, bundled.side, bundled.side))
+        assert {round(row["crop_gflop"] * 2e9) for row in rows} == {counter.get_total_flops()}
 
 
 def test_borders_near_the_outlines_of_masks_are_counted(monkeypatch):
