@@ -1,14 +1,17 @@
-"""Image encoders against matrix products of the same sizes: milliseconds and operations of an image and of a photo.
+"""Image encoders against matrix products of the same sizes: milliseconds and operations of a crop and of a photo.
 
     python benchmarks/features.py [--threads 1] [--repeats 9] [--json FILE]
     python benchmarks/features.py --precisions [--batches 8 64] [--repeats 3]
 
-Encoders: the bundled CLIP, and the image tower of a ViT-B/16 with random weights.
+Encoders: the bundled CLIP, and the image tower of a ViT-B/16 with random weights. They run as in a build on the CPU:
+crops are embedded with their patches, in batches of the same size, in bfloat16 where the processor is faster in it.
+A further row has the same in float32.
 
-    products    time of only the matrix products of the forward pass, by torch on contiguous matrices of the same
-                sizes: what the processor reaches
-    share       products / forward: 1 would be an encoder that does nothing but matrix products at full speed
-    crops       crops of a photo of the demo with its settings; "photo" is the time and operations of all of them
+    precision   that of the matrix products of the forward pass
+    products    GFLOP/s of only these products, by torch on contiguous matrices of the same sizes and precision: what
+                the processor reaches
+    share       of this peak that the encoder reaches: 1 would be an encoder that does nothing but matrix products
+    photo       all crops of a photo of the demo with the default settings of the encoder, without cutting them
 
 ``--precisions`` runs the ViT-B/16 in float32, in bfloat16 as lexsplat does (autocast) and with its weights in
 bfloat16, in 8-bit integers (torch's dynamic quantization), and in ONNX Runtime in float32 and in 8-bit integers where
@@ -28,7 +31,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from unittest import mock
 
 import numpy as np
 import torch
@@ -39,12 +43,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from lexsplat.captures import load_capture
 from lexsplat.evaluation.demo import demo_capture
-from lexsplat.features import FeatureConfig
+from lexsplat.features import FeatureConfig, pretrained
 from lexsplat.features.checks import bundled_images
 from lexsplat.features.clip_image import ClipImages
 from lexsplat.features.encoders import load_clip
-from lexsplat.features.extraction import encoded_size
-from lexsplat.features.pyramid import grid_levels, unique_boxes
+from lexsplat.features.estimate import count_crops
+from lexsplat.features.extraction import cpu_batch
 
 aten = torch.ops.aten
 SIDE = 224
@@ -52,32 +56,65 @@ SIDE = 224
 Encode = Callable[[Tensor], Tensor]
 
 
+class Product(NamedTuple):
+    """The sizes and the precision of a product of matrices, or of a batch of them."""
+
+    batch: int
+    rows: int
+    inner: int
+    columns: int
+    dtype: torch.dtype
+
+    @property
+    def operations(self) -> int:
+        """Multiplications and additions."""
+        return 2 * self.batch * self.rows * self.inner * self.columns
+
+    def matrices(self) -> tuple[Tensor, Tensor]:
+        """Random factors, without a batch of one."""
+        left = torch.rand(self.batch, self.rows, self.inner).to(self.dtype)
+        right = torch.rand(self.batch, self.inner, self.columns).to(self.dtype)
+        return (left[0], right[0]) if self.batch == 1 else (left, right)
+
+
+class Case(NamedTuple):
+    """An encoder as a build runs it, and its default settings on a CPU."""
+
+    name: str
+    encode: Callable[[Tensor], object]
+    side: int
+    config: FeatureConfig
+
+
 class Products(TorchDispatchMode):
-    """Counts the matrix products of a computation by their sizes (batch, rows, inner, columns)."""
+    """Counts the matrix products of a computation."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.sizes: Counter[tuple[int, int, int, int]] = Counter()
+        self.counts: Counter[Product] = Counter()
 
     def __torch_dispatch__(self, function, kinds, arguments=(), options=None):  # type: ignore[no-untyped-def]
         result = function(*arguments, **(options or {}))
         name = function.overloadpacket
         if name in (aten.mm, aten.addmm, aten.bmm, aten.baddbmm, aten.matmul):
             left, right = [a for a in arguments if isinstance(a, Tensor)][-2:]
-            self.sizes[math.prod(left.shape[:-2]), left.shape[-2], left.shape[-1], right.shape[-1]] += 1
+            self._count(left, math.prod(left.shape[:-2]), *left.shape[-2:], right.shape[-1])
         elif name is aten.linear:
-            rows, weight = arguments[0].numel() // arguments[0].shape[-1], arguments[1]
-            self.sizes[1, rows, weight.shape[1], weight.shape[0]] += 1
+            left, weight = arguments[:2]
+            self._count(left, 1, left.numel() // left.shape[-1], weight.shape[1], weight.shape[0])
         elif name in (aten.convolution, aten.conv2d):
             weight = arguments[1]
             pixels = result.numel() // weight.shape[0]
-            self.sizes[1, pixels, math.prod(weight.shape[1:]), weight.shape[0]] += 1
+            self._count(weight, 1, pixels, math.prod(weight.shape[1:]), weight.shape[0])
         elif "scaled_dot_product" in str(name):
             query, key = arguments[:2]
             batch, (rows, inner), columns = math.prod(query.shape[:-2]), query.shape[-2:], key.shape[-2]
-            self.sizes[batch, rows, inner, columns] += 1
-            self.sizes[batch, rows, columns, inner] += 1
+            self._count(query, batch, rows, inner, columns)
+            self._count(query, batch, rows, columns, inner)
         return result
+
+    def _count(self, factor: Tensor, *sizes: int) -> None:
+        self.counts[Product(*sizes, factor.dtype)] += 1
 
 
 def vit_b16() -> torch.nn.Module:
@@ -98,10 +135,16 @@ def vit_b16_tower() -> ClipImages:
     return ClipImages(CLIPModel(CLIPConfig(vision_config=vision, text_config=text)).eval())
 
 
-def crops_of_a_photo() -> int:
-    capture, config = load_capture(demo_capture("tabletop")), FeatureConfig.bundled()
-    size = encoded_size(next(iter(capture.views.values())).capture_size, config)
-    return len(unique_boxes(grid_levels(*size, config.crop_sizes, config.crop_strides))[0])
+def cases() -> Iterator[Case]:
+    """The bundled encoder, then the ViT-B/16; both settings read crops and their patches."""
+    clip, vision = load_clip("bundled"), vit_b16_tower()
+    yield Case("bundled", clip.encode_patches, clip.image_size, FeatureConfig.bundled())
+
+    def encode(images: Tensor) -> Tensor:
+        with pretrained.precision(images.device, crops=True):
+            return vision(images, patches=True)
+
+    yield Case("ViT-B/16", encode, SIDE, FeatureConfig.sparse(vision.patches))
 
 
 def timed(function: Callable[[], object]) -> float:
@@ -111,28 +154,58 @@ def timed(function: Callable[[], object]) -> float:
 
 
 @torch.inference_mode()
-def run_case(name: str, encode: Encode, side: int, batch: int, repeats: int) -> dict[str, float]:
-    images = torch.rand(batch, 3, side, side)
-    encode(images)  # the first call also tries which precision is faster
+def run_case(case: Case, size: tuple[int, int], repeats: int) -> dict[str, Any]:
+    """Times and operations of a crop, and of all crops of a photo of this width and height."""
+    batch, crops = cpu_batch(case.side), count_crops(case.config, size)
+    images = torch.rand(batch, 3, case.side, case.side)
+    case.encode(images)  # the first call also tries which precision is faster
     with Products() as products:
-        encode(images)
-    sizes = products.sizes
-    matrices = {size: (torch.rand(size[:3]), torch.rand(size[0], size[2], size[3])) for size in sizes}
+        case.encode(images)
+    factors = [(*product.matrices(), count) for product, count in products.counts.items()]
 
     def multiply() -> None:
-        for size, count in sizes.items():
-            left, right = matrices[size]
+        for left, right, count in factors:
             for _ in range(count):
-                left[0] @ right[0] if size[0] == 1 else torch.bmm(left, right)
+                left @ right
 
     multiply()
-    times = np.array([(timed(lambda: encode(images)), timed(multiply)) for _ in range(repeats)])
+    times = np.array([(timed(lambda: case.encode(images)), timed(multiply)) for _ in range(repeats)])
     forward, alone = np.median(times, 0)
-    operations = sum(2 * math.prod(size) * count for size, count in sizes.items())
+    operations = sum(product.operations * count for product, count in products.counts.items())
+    kinds = sorted({str(product.dtype).removeprefix("torch.") for product in products.counts})
     return {
-        "encoder": name, "batch": batch, "image_ms": forward / batch, "image_gflop": operations / batch / 1e9,
-        "gflops": operations / forward / 1e6, "products_gflops": operations / alone / 1e6, "share": alone / forward,
+        "encoder": case.name, "precision": ", ".join(kinds), "batch": batch, "crop_ms": forward / batch,
+        "crop_gflop": operations / batch / 1e9, "gflops": operations / forward / 1e6,
+        "products_gflops": operations / alone / 1e6, "share": alone / forward, "crops": crops,
+        "photo_ms": crops * forward / batch, "photo_gflop": crops * operations / batch / 1e9,
     }  # fmt: skip
+
+
+def run_encoders(repeats: int) -> list[dict[str, Any]]:
+    """A row for each encoder as a build runs it, and one in float32 where that is another precision."""
+    size = next(iter(load_capture(demo_capture("tabletop")).views.values())).capture_size
+    print(
+        f"{'encoder':8} {'precision':9} {'ms/crop':>8} {'GFLOP':>6} {'GFLOP/s':>8} {'products':>8} {'share':>5}"
+        f" {'crops':>5} {'ms/photo':>8} {'GFLOP/photo':>11}"
+    )
+    rows: list[dict[str, Any]] = []
+    for case in cases():
+        rows.append(run_case(case, size, repeats))
+        print_row(rows[-1])
+        if rows[-1]["precision"] != "float32":
+            with mock.patch.object(pretrained, "bfloat16_is_faster", return_value=False):
+                rows.append(run_case(case, size, repeats))
+            print_row(rows[-1])
+    return rows
+
+
+def print_row(row: dict[str, Any]) -> None:
+    print(
+        f"{row['encoder']:8} {row['precision']:9} {row['crop_ms']:8.2f} {row['crop_gflop']:6.3f} {row['gflops']:8.1f}"
+        f" {row['products_gflops']:8.1f} {row['share']:5.2f} {row['crops']:5} {row['photo_ms']:8.0f}"
+        f" {row['photo_gflop']:11.1f}",
+        flush=True,
+    )
 
 
 def precision_cases(model: torch.nn.Module, threads: int) -> Iterator[tuple[str, Encode]]:
@@ -217,26 +290,8 @@ def main() -> None:
     if options.precisions:
         rows = run_precisions(options.threads, options.batches, options.repeats)
         return write_record(options.json, rows, threads=options.threads)
-    clip, vision, crops = load_clip("bundled"), vit_b16_tower(), crops_of_a_photo()
-    cases = (
-        ("bundled", clip.encode_images, clip.image_size, 64),
-        ("ViT-B/16", lambda images: vision(images, patches=False), SIDE, 8),
-    )
-    print(f"{options.threads} threads, {crops} crops in a photo")
-    print(
-        f"{'encoder':10} {'ms/image':>9} {'GFLOP':>7} {'GFLOP/s':>8} {'products':>9} {'share':>6} {'s/photo':>8}"
-    )
-    rows = []
-    for case in cases:
-        row = run_case(*case, options.repeats)
-        row["photo_seconds"] = crops * row["image_ms"] / 1e3
-        rows.append(row)
-        print(
-            f"{row['encoder']:10} {row['image_ms']:9.2f} {row['image_gflop']:7.3f} {row['gflops']:8.1f}"
-            f" {row['products_gflops']:9.1f} {row['share']:6.2f} {row['photo_seconds']:8.2f}",
-            flush=True,
-        )
-    write_record(options.json, rows, threads=options.threads, crops=crops)
+    print(f"{options.threads} threads")
+    write_record(options.json, run_encoders(options.repeats), threads=options.threads)
 
 
 if __name__ == "__main__":

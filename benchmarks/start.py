@@ -31,6 +31,7 @@ CASES = {
     "query --help": ["-m", "lexsplat", "query", "--help"],
     "info": ["-m", "lexsplat", "info", "demo"],
     "query": ["-m", "lexsplat", "query", "demo", "red apple"],
+    "query --no-images": ["-m", "lexsplat", "query", "demo", "red apple", "--no-images"],
     "find": ["-m", "lexsplat", "find", "demo", "red apple"],
     "find, first": ["-m", "lexsplat", "find", "demo", "{word}"],
     "find, again": ["-m", "lexsplat", "find", "demo", "{word}"],
@@ -80,10 +81,10 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=9)
     options = parser.parse_args()
     rows = measure(options.repeats)
-    print(f"{'command':<14} {'wall':>7} {'cpu':>7} {'ratio':>6} {'of cpu':>7} {'wanted':>7}")
+    print(f"{'command':<17} {'wall':>7} {'cpu':>7} {'ratio':>6} {'of cpu':>7} {'wanted':>7}")
     for row in rows:
         print(
-            f"{row['command']:<14} {row['wall_seconds']:6.2f}s {row['cpu_seconds']:6.2f}s {row['ratio']:6.2f} "
+            f"{row['command']:<17} {row['wall_seconds']:6.2f}s {row['cpu_seconds']:6.2f}s {row['ratio']:6.2f} "
             f"{row['cpu_ratio']:7.2f} {row['wanted'] or '-':>7}"
         )
     write_record(options.json, rows, repeats=options.repeats)

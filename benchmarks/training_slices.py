@@ -29,6 +29,11 @@ except ImportError:  # the flat modules before the fifteen packages
 from lexsplat.reconstruction import Reconstructor
 from lexsplat.rendering import render
 
+try:
+    from lexsplat.reconstruction.few_photos import has_few_photos, points_between
+except ImportError:  # `d4e65b3` adds no points
+    has_few_photos = None  # type: ignore[assignment]
+
 VALIDATION_EVERY = 6
 SLICE_BEFORE = 4  # steps of a training that is thrown away: kernels are compiled in it
 
@@ -44,7 +49,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     capture, config = prepared(options)
-    points = initial_points(capture, seed=0)
+    points = starting_points(capture, options.seed)
     before = Reconstructor(capture, config, points, device="cpu", seed=options.seed)
     for _ in range(SLICE_BEFORE):
         before.step()
@@ -81,6 +86,14 @@ def prepared(options: argparse.Namespace) -> tuple[Any, Any]:
     training = dataclasses.replace(config.reconstruction, **options.settings)
     iterations = max(1, round(options.length * training.iterations))
     return capture, dataclasses.replace(training, iterations=iterations)
+
+
+def starting_points(capture: Any, seed: int) -> Any:
+    """The points from which ``lexsplat build`` of the same version trains: few photos get more, if it adds any."""
+    points = initial_points(capture, seed=seed)
+    if has_few_photos is None or points.origin == "random" or not has_few_photos(capture):
+        return points
+    return points_between(capture, points, seed)
 
 
 @torch.no_grad()

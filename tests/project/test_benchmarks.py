@@ -6,6 +6,7 @@ import runpy
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -107,6 +108,36 @@ def test_the_naive_port_learns(monkeypatch):
     assert np.mean(losses[24:]) < 0.9 * np.mean(losses[:24])
 
 
+def test_trainings_in_slices_start_from_the_points_of_a_build(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import training_slices
+
+    from lexsplat import reconstruction
+    from lexsplat.captures import load_capture
+    from lexsplat.evaluation.demo import demo_capture
+
+    capture, started = load_capture(demo_capture("second")), []
+
+    class Started(Exception):
+        pass
+
+    def start(capture, config, points, **options):
+        started.append(points)
+        raise Started
+
+    monkeypatch.setattr(reconstruction, "Reconstructor", start)
+    with pytest.raises(Started):
+        reconstruction.reconstruct(capture, reconstruction.ReconstructionConfig(iterations=1), seed=3)
+    points = training_slices.starting_points(capture, 3)
+    assert len(points.points) > len(capture.points)  # 24 photos are few
+    assert np.array_equal(points.points, started[0].points)
+    assert np.array_equal(points.colors, started[0].colors)
+    # Commits before the module have no points to add.
+    monkeypatch.setitem(sys.modules, "lexsplat.reconstruction.few_photos", None)
+    earlier = runpy.run_path(training_slices.__file__)["starting_points"]
+    assert np.array_equal(earlier(capture, 3).points, capture.points)
+
+
 def test_a_project_for_opensplat_holds_the_training_views_and_points(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
     import opensplat
@@ -187,7 +218,33 @@ def test_operations_of_an_encoder_are_those_of_its_matrix_products(monkeypatch):
     with torch.inference_mode(), features.Products() as products:
         layer(torch.rand(2, 3, 8, 8))
     # The convolution has 2 x 4 outputs of 48 inputs, the linear layer 2 x 8 rows.
-    assert dict(products.sizes) == {(1, 8, 48, 8): 1, (1, 16, 4, 5): 1}
+    assert dict(products.counts) == {(1, 8, 48, 8, torch.float32): 1, (1, 16, 4, 5, torch.float32): 1}
+    assert sum(product.operations for product in products.counts) == 2 * (8 * 48 * 8 + 16 * 4 * 5)
+
+
+def test_encoders_are_measured_with_the_settings_and_in_the_precision_of_a_build(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import features
+    from torch.utils.flop_counter import FlopCounterMode
+
+    from lexsplat.features.clip import DEFAULT_CLIP
+    from lexsplat.pipeline.config import BuildConfig
+
+    monkeypatch.setattr(features, "vit_b16_tower", lambda: SimpleNamespace(patches=14))
+    monkeypatch.setattr("lexsplat.pipeline.config.patch_grid", lambda name: 14)
+    bundled, vision = features.cases()
+    for case, clip in ((bundled, "bundled"), (vision, DEFAULT_CLIP)):
+        assert case.config == BuildConfig(clip=clip).resolved("cpu", (640, 480)).features
+        assert case.config.tokens == "both"
+    monkeypatch.setattr(features, "cases", lambda: [bundled])
+    monkeypatch.setattr(features, "cpu_batch", lambda side: 2)
+    for faster, expected in ((True, ["bfloat16", "float32"]), (False, ["float32"])):
+        monkeypatch.setattr(features.pretrained, "bfloat16_is_faster", lambda faster=faster: faster)
+        rows = features.run_encoders(1)
+        assert [row["precision"] for row in rows] == expected
+        with torch.inference_mode(), FlopCounterMode(display=False) as counter:
+            bundled.encode(torch.rand(2, 3, bundled.side, bundled.side))
+        assert {round(row["crop_gflop"] * 2e9) for row in rows} == {counter.get_total_flops()}
 
 
 def test_borders_near_the_outlines_of_masks_are_counted(monkeypatch):
