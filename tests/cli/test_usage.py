@@ -292,6 +292,32 @@ def test_help_pages_have_words_for_placeholders_and_defaults(command, capsys):
     assert len(options_of(page)) <= 16
 
 
+def default_of(option: str, page: str) -> str:
+    """The default that a help page states for an option, the words joined over its lines."""
+    text = " ".join(page.replace("│", " ").split())
+    return text.partition(f" {option} ")[2].partition("(default: ")[2].partition(")")[0]
+
+
+def test_an_option_with_a_placeholder_of_its_own_has_its_default_in_words(capsys):
+    page = help_page(capsys, "encoders", "--help")
+    assert "--capture CAPTURE" in page
+    assert default_of("--capture", page) == "100 photos of 1440x1080"
+    assert default_of("--index", help_page(capsys, "library", "--help")) == "compare with all scenes"
+
+
+@pytest.mark.parametrize("command", ["build", "compare", "ablate"])
+def test_a_setting_of_a_part_has_its_default_in_words(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")  # one column
+    page = help_page(capsys, command, "--help-all")
+    assert default_of("--averaged.dino", page) == "by the tokens of CLIP"
+
+
+def test_the_help_page_of_build_states_which_methods_use_dino(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    page = " ".join(help_page(capsys, "build", "--help").replace("│", " ").split())
+    assert 'Method "trained" uses it, and "averaged" where CLIP is read at class tokens alone' in page
+
+
 @pytest.mark.parametrize(
     ("command", "rare"),
     [
