@@ -66,7 +66,9 @@ def find_opensplat(place: str | None, folder: Path) -> str:
         "cmake", "-S", place, "-B", str(build), "-DCMAKE_BUILD_TYPE=Release", "-DGPU_RUNTIME=CPU",
         f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}",
     )  # fmt: skip
-    _run("cmake", "--build", str(build), "--target", "opensplat")
+    # A number: without one, make starts all of its jobs at once.
+    jobs = str(os.cpu_count() or 1)
+    _run("cmake", "--build", str(build), "--target", "opensplat", "--parallel", jobs)
     return str(build / "opensplat")
 
 

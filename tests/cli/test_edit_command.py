@@ -9,7 +9,9 @@ import pytest
 from support.command_line import Terminal, fails_in_one_line, modified
 
 from lexsplat import cli, open_scene
+from lexsplat.cli.waiting import LateProgress
 from lexsplat.queries.visibility import whole_things
+from lexsplat.scenes import editing
 from lexsplat.scenes.folder import BUNDLED_SCENE
 
 
@@ -82,6 +84,29 @@ def test_the_journal_holds_the_motions_of_the_command_line(built, tmp_path, caps
     assert copied["translation"] == [0.0, 0.0, 1.0]
     assert np.array(copied["rotation"]) == pytest.approx(np.eye(3))
     assert "2. duplicate blue ball" in capsys.readouterr().out
+
+
+def test_steps_are_applied_within_a_stage_of_progress(built, tmp_path, monkeypatch):
+    copy = tmp_path / "scene"
+    shutil.copytree(built, copy)
+    running: list[str] = []
+    applied: list[list[str]] = []
+
+    def listen(self, event):
+        (running.remove if event.done else running.append)(event.stage)
+
+    def apply(*step):
+        applied.append([*running])
+        return original(*step)
+
+    monkeypatch.setattr(LateProgress, "__call__", listen)
+    original = editing.apply
+    monkeypatch.setattr(editing, "apply", apply)
+    move = ("move", "--select", "blue ball", "--threshold", "0.05", "--by", "0", "0", "1")
+    for words in (move, move, ("undo",), ("redo",)):
+        assert cli.main(["edit", str(copy), *words]) == 0
+    assert len(applied) == 1 + 2 + 3 + 2, "each command replays the steps so far"
+    assert all("steps" in stages for stages in applied)
 
 
 @pytest.mark.parametrize(

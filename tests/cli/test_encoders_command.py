@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 from pathlib import Path
@@ -38,6 +39,55 @@ def test_the_answer_has_its_schema_and_the_time_of_the_capture(tiny_capture, cap
     photos = len(load_capture(tiny_capture).train_names)
     assert document["time"]["photos"] == photos < 12
     assert document["time"]["seconds"] == pytest.approx(photos * document["time"]["seconds_per_photo"])
+
+
+@pytest.fixture
+def towers(monkeypatch) -> dict[str, int]:
+    """How often DINO is loaded, checked, and counted in a time."""
+    from lexsplat.features import encoders, estimate
+
+    counts = dict.fromkeys(("loaded", "checked", "counted"), 0)
+    load, check, measure = encoders.load_dino, checks.check_dense, estimate.estimate
+
+    def loaded(*arguments):
+        counts["loaded"] += 1
+        return load("bundled")  # for the default, which is not on this machine
+
+    def checked(dino):
+        counts["checked"] += 1
+        check(dino)
+
+    def counted(clip, dino, *arguments):
+        counts["counted"] += dino is not None
+        return measure(clip, dino, *arguments)
+
+    monkeypatch.setattr(encoders, "load_dino", loaded)
+    monkeypatch.setattr(checks, "check_dense", checked)
+    monkeypatch.setattr(estimate, "estimate", counted)
+    return counts
+
+
+def at_class_tokens(monkeypatch) -> None:
+    """The bundled CLIP is read at class tokens alone, as models of other architectures are."""
+    settings = dataclasses.replace(FeatureConfig.bundled(), crop_tokens="class")
+    monkeypatch.setattr(FeatureConfig, "bundled", lambda: settings)
+
+
+def test_with_patch_tokens_the_default_dino_is_neither_loaded_nor_counted(towers):
+    assert cli.main(["encoders", "--clip", "bundled"]) == 0
+    assert towers == {"loaded": 0, "checked": 0, "counted": 0}
+
+
+def test_with_class_tokens_the_default_dino_is_checked_and_counted(towers, monkeypatch, capsys):
+    at_class_tokens(monkeypatch)
+    assert cli.main(["encoders", "--clip", "bundled"]) == 0
+    assert towers == {"loaded": 1, "checked": 1, "counted": 1}
+
+
+def test_a_dino_that_the_build_leaves_out_is_checked_and_not_counted(towers, capsys):
+    assert cli.main(["encoders", "--clip", "bundled", "--dino", "bundled", "--json"]) == 0
+    assert towers == {"loaded": 1, "checked": 1, "counted": 0}
+    assert "dino" in json.loads(capsys.readouterr().out)
 
 
 def test_random_weights_are_refused_with_status_1(clip_folder, capsys):

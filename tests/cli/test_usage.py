@@ -1,9 +1,8 @@
-"""Help pages, wrong usage, Ctrl-C and closed pipes of the command line."""
+"""Wrong usage, Ctrl-C and closed pipes of the command line."""
 
 import contextlib
 import errno
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -91,11 +90,6 @@ def test_splats_in_place_of_a_capture_are_sent_to_language(command, arguments, t
         cli.main([command, *arguments, "--output", "scene"])
     assert caught.value.code == 2
     assert "lexsplat language --splats FILE --output SCENE" in capsys.readouterr().err
-
-
-def test_the_help_page_of_language_has_the_options_that_its_warnings_name(capsys):
-    options = options_of(help_page(capsys, "language", "--help"))
-    assert {"--up", "--keep-floaters", "--views-from"} <= options
 
 
 STOPPED = "stopped; run the same command again to go on\n"
@@ -267,57 +261,6 @@ def test_the_overview_lists_every_command(capsys):
     for name, entry in cli.COMMANDS.items():
         assert f"  {name} " in page
         assert entry.summary in page
-
-
-def help_page(capsys, *arguments: str) -> str:
-    with pytest.raises(SystemExit) as ended:
-        cli.main([*arguments])
-    assert ended.value.code == 0
-    return capsys.readouterr().out
-
-
-def options_of(page: str) -> set[str]:
-    """The options that start a line of a help page, with or without a frame."""
-    lines = (line.strip("│ ") for line in page.splitlines())
-    return {word for line in lines if line.startswith("-") for word in re.findall(r"--[\w.-]*\w", line)}
-
-
-@pytest.mark.parametrize("command", cli.COMMANDS)
-def test_help_pages_have_words_for_placeholders_and_defaults(command, capsys):
-    page = help_page(capsys, command, "--help")
-    assert "STR" not in page + help_page(capsys, command, "--help-all")
-    assert "(default: )" not in page
-    assert "None" not in page
-    assert "`" not in page
-    assert len(options_of(page)) <= 16
-
-
-@pytest.mark.parametrize(
-    ("command", "rare"),
-    [
-        ("ablate", {"--forms", "--wrong-labels", "--prompt-list", "--as-in-paper"}),
-        ("compare", {"--protocols", "--prompt-list", "--no-lpips"}),
-        ("language", {"--progress", "--test-views", "--test-every"}),
-        ("edit", {"--grow", "--shrink", "--no-fill", "--strength", "--clip"}),
-    ],
-)
-def test_rare_options_are_on_the_whole_page_only(command, rare, capsys):
-    short = help_page(capsys, command, "--help")
-    assert f"lexsplat {command} --help-all" in short
-    assert not rare & options_of(short)
-    assert rare <= options_of(help_page(capsys, command, "--help-all"))
-
-
-@pytest.mark.parametrize("command", ["build", "reconstruct", "language", "compare", "ablate"])
-def test_help_shows_what_people_use_and_help_all_the_rest(command, capsys):
-    short = help_page(capsys, command, "--help")
-    assert {"--output", "--device", "--iterations", "--downscale", "--seed", "--memory"} <= options_of(short)
-    assert f"lexsplat {command} --help-all" in short
-    whole = options_of(help_page(capsys, command, "--help-all"))
-    assert options_of(short) < whole
-    assert "--reconstruction.max-gaussians" in whole - options_of(short)
-    assert ("--codebook.num-codes" in whole) == (command != "reconstruct")
-    assert ("--clip" in whole) == (command != "reconstruct")
 
 
 def test_the_help_page_that_an_error_names_is_that_of_the_command(capsys):

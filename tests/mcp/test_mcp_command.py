@@ -9,11 +9,25 @@ import sys
 import pytest
 
 from lexsplat import cli
+from lexsplat.scenes.library import Library
 
 
-def run(*arguments):
-    command = [sys.executable, "-m", "lexsplat", "mcp", "demo", *arguments]
-    return subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=300)
+@pytest.fixture
+def free_port() -> str:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return str(free.getsockname()[1])
+
+
+def run(*arguments, said="", patience=3600.0):
+    """The end of a server whose client says something and leaves; it shows waits beyond the patience in seconds."""
+    program = (
+        "import sys; from lexsplat import cli; from lexsplat.cli.waiting import LateProgress\n"
+        f"LateProgress.__init__.__defaults__ = ({patience},)\n"
+        f"sys.exit(cli.main({['mcp', 'demo', *arguments]}))"
+    )
+    command = [sys.executable, "-c", program]
+    return subprocess.run(command, input=said, capture_output=True, text=True, timeout=300)
 
 
 @pytest.mark.slow
@@ -21,6 +35,27 @@ def test_a_client_that_leaves_at_once_leaves_a_server_that_ends_in_order():
     for _ in range(2):  # the warm-up may be anywhere
         left = run()
         assert (left.returncode, left.stderr) == (0, "")
+
+
+@pytest.mark.slow
+def test_progress_is_shown_on_standard_error_and_standard_output_is_the_protocol():
+    left = run(said=json.dumps(INITIALIZE) + "\n", patience=0.0)
+    assert left.returncode == 0
+    assert "start: 0:00 so far" in left.stderr
+    assert "scene: 0:00 so far" in left.stderr
+    assert [json.loads(line)["id"] for line in left.stdout.splitlines()] == [1]
+
+
+def test_opening_scenes_and_a_library_sends_events_of_progress(tmp_path, monkeypatch, free_port, capsys):
+    Library.create(tmp_path / "rooms", device="cpu")
+    events = []
+    monkeypatch.setattr("lexsplat.cli.mcp.LateProgress", lambda: events.append)
+    monkeypatch.setattr("lexsplat.mcp.server.serve_http", lambda *_: None)
+    monkeypatch.setattr("lexsplat.scenes.serving.OpenScene.warm", lambda _: None)
+    assert cli.main(["mcp", str(tmp_path / "rooms"), "demo", "--http", "--port", free_port]) == 0
+    assert [(event.stage, event.done) for event in events] == [
+        ("library", 0), ("library", 1), ("scene", 0), ("scene", 1),
+    ]  # fmt: skip
 
 
 @pytest.mark.slow
@@ -53,11 +88,8 @@ INITIALIZE = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("over", ["stdio", "http"])
-def test_ctrl_c_ends_a_server_in_order_though_its_client_stays(over):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    words = ["mcp", "demo", *(["--http", "--port", port] if over == "http" else [])]
+def test_ctrl_c_ends_a_server_in_order_though_its_client_stays(over, free_port):
+    words = ["mcp", "demo", *(["--http", "--port", free_port] if over == "http" else [])]
     # A job in the background is started with Ctrl-C ignored.
     program = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
@@ -79,12 +111,10 @@ def test_ctrl_c_ends_a_server_in_order_though_its_client_stays(over):
             server.kill()
 
 
-def test_a_server_over_http_states_its_address(monkeypatch, capsys):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+def test_a_server_over_http_states_its_address(monkeypatch, free_port, capsys):
     monkeypatch.setattr("lexsplat.mcp.server.serve_http", lambda *_: None)
-    assert cli.main(["mcp", "demo", "--http", "--port", str(port)]) == 0
+    assert cli.main(["mcp", "demo", "--http", "--port", free_port]) == 0
     assert (
-        capsys.readouterr().out == f"demo served at http://127.0.0.1:{port}/mcp (Ctrl-C stops the server)\n"
+        capsys.readouterr().out
+        == f"demo served at http://127.0.0.1:{free_port}/mcp (Ctrl-C stops the server)\n"
     )

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import runpy
 import sys
 from dataclasses import replace
@@ -331,7 +332,9 @@ def test_opensplat_is_fetched_once_built_and_skipped_with_the_reason(monkeypatch
     monkeypatch.setenv("PATH", str(programs), prepend=":")
     for _ in range(2):
         assert opensplat.find_opensplat("fetch", sources) == str(sources / "build" / "opensplat")
-    commands = [line.split()[:2] for line in log.read_text().splitlines()]
+    lines = log.read_text().splitlines()
+    assert lines[-1].endswith(f"--parallel {os.cpu_count()}")
+    commands = [line.split()[:2] for line in lines]
     built = [["cmake", "-S"], ["cmake", "--build"]]
     assert commands == [["git", "clone"], ["git", "-C"], *built, *built]
     assert opensplat.find_opensplat("/usr/bin/opensplat", sources) == "/usr/bin/opensplat"

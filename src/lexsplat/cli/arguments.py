@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import inspect
 import io
 import re
@@ -61,8 +62,12 @@ _DEFAULTS = {
     "downscale": "chosen for the device",
     "iterations": "chosen for the device",
     "up": "from the cameras",
+    "averaged.dino": "by the tokens of CLIP",
 }
-"""What help pages state as the default of an option that is None or empty, unless the command states another."""
+"""What help pages state as the default of an option that is None or empty, unless the command states another.
+
+Settings of a part have the name of the part in front.
+"""
 
 _RENAMED = {
     "--averaging.": "--averaged.",
@@ -173,22 +178,30 @@ def _description(command: type) -> str:
     return "\n\n".join(block if block.startswith(" ") else textwrap.fill(block, width) for block in blocks)
 
 
-def _help_page(kind: type, hidden: set[str], defaults: dict[str, str]) -> type:
-    """A dataclass of the same name for help only: fields suppressed, placeholders and defaults in words."""
+def _help_page(kind: type, hidden: set[str], defaults: dict[str, str], part: str = "") -> type:
+    """A dataclass of the same name for help only: fields suppressed, placeholders and defaults in words.
+
+    Args:
+        kind: A command, its settings, or a part of them.
+        hidden: Names of the fields to suppress.
+        defaults: Defaults in words.
+        part: What the options of a part begin with, such as "averaged.".
+    """
     hints = get_type_hints(kind, include_extras=True)
     fields = []
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
         default: Any = field.default
         factory: Any = field.default_factory
-        if field.name == "settings" and factory is not dataclasses.MISSING:
-            example = factory()
-            page = _help_page(type(example), hidden, {})
-            values = {part.name: getattr(example, part.name) for part in dataclasses.fields(example)}
-            hint = Annotated[page, tyro.conf.arg(name="")]  # as `settings.Settings`
-            factory = _maker(page, values)
-        elif get_origin(hint) is not Annotated:
-            hint = Annotated[hint, _in_words(field.name, hint, default, defaults)]
+        if factory is not dataclasses.MISSING and dataclasses.is_dataclass(example := factory()):
+            is_whole = field.name == "settings"
+            inner = hidden if is_whole else set()
+            page = _help_page(type(example), inner, {}, "" if is_whole else f"{field.name}.")
+            # As `settings.Settings`, whose options have no name in front.
+            hint = Annotated[page, tyro.conf.arg(name="")] if is_whole else page
+            default, factory = dataclasses.MISSING, functools.partial(_filled, page, example)
+        else:
+            hint = _with_words(part + field.name, hint, default, defaults)
         if field.name in hidden:
             hint = Annotated[hint, tyro.conf.Suppress]
         fields.append(
@@ -211,8 +224,22 @@ def _arguments_section(kind: type) -> str:
     return "Options.\n\nArgs:\n" + re.sub(r"\n {8,}", " ", "\n".join(filter(None, sections))).replace("`", "")
 
 
-def _maker(page: type, values: dict[str, Any]) -> Any:
-    return lambda: page(**values)
+def _filled(page: type, example: Any) -> Any:
+    """A page with the values of an example; its parts are pages, too."""
+    values = {}
+    for field in dataclasses.fields(page):
+        value = getattr(example, field.name)
+        if dataclasses.is_dataclass(value):
+            value = _filled(type(field.default_factory()), value)  # type: ignore[operator]
+        values[field.name] = value
+    return page(**values)
+
+
+def _with_words(name: str, hint: Any, default: Any, defaults: dict[str, str]) -> Any:
+    """A type with placeholder and default in words, where it has none of its own."""
+    kind, *own = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    # In front: tyro takes the last one given.
+    return Annotated[(kind, _in_words(name, kind, default, defaults), *own)]  # type: ignore[return-value]
 
 
 def _in_words(name: str, kind: Any, default: Any, defaults: dict[str, str]) -> Any:

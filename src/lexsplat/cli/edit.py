@@ -153,7 +153,8 @@ class Edit:
             self._discard(journal)
         with uncounted(scene.listener, "steps"):
             editor = Editor(scene, journal)
-        if self.action in ("undo", "redo") and not getattr(editor, self.action)():
+            idle = self.action in ("undo", "redo") and not getattr(editor, self.action)()
+        if idle:
             print(f"nothing to {self.action}")
         elif self.action == "save" and self.output:
             with uncounted(scene.listener, "save"):
@@ -183,15 +184,16 @@ class Edit:
         chosen = chosen.grow(self.grow) if self.grow is not None else chosen
         chosen = chosen.shrink(self.shrink) if self.shrink is not None else chosen
         try:
-            if self.action == "recolor" and self.color:
-                editor.recolor(chosen, self.color, self.strength)
-            elif self.action in ("move", "duplicate"):
-                turn = rotation_about(chosen.up.direction, self.turn)
-                getattr(editor, self.action)(chosen, Motion(self.by, turn, self.scale))
-            elif self.action == "delete":
-                editor.delete(chosen, self.fill)
-            else:
-                editor.keep(chosen)
+            with uncounted(editor.original.listener, "steps"):
+                if self.action == "recolor" and self.color:
+                    editor.recolor(chosen, self.color, self.strength)
+                elif self.action in ("move", "duplicate"):
+                    turn = rotation_about(chosen.up.direction, self.turn)
+                    getattr(editor, self.action)(chosen, Motion(self.by, turn, self.scale))
+                elif self.action == "delete":
+                    editor.delete(chosen, self.fill)
+                else:
+                    editor.keep(chosen)
         except ValueError as error:  # numbers that are only invalid together or for these Gaussians
             raise QueryError(
                 self.action, expected="Gaussians that can be drawn afterwards", found=str(error)

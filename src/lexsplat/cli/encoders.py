@@ -25,8 +25,8 @@ class EncodersCommand:
 
     Args:
         clip: Image-text encoder: a name on the Hugging Face Hub, a folder, or "bundled".
-        dino: Dense encoder to check, too: a name, a folder, "bundled", or "none". By default
-            that of a build, which needs one where CLIP is read at class tokens only.
+        dino: Dense encoder to check, too: a name, a folder, "bundled", or "none". The time counts it where a build
+            needs it: where CLIP is read at class tokens alone.
         capture: Folder of photos or capture for which the time is stated.
         device: Device of the rasterizer.
         encoder_device: Device of the encoders; "auto" takes that of the rasterizer.
@@ -84,7 +84,7 @@ class EncodersCommand:
             check_dense(encoders.dino)
             facts["dino"] = _facts(encoders.dino)
         progress(Event("encoders", 3, 4))
-        found = estimate(clip, encoders.dino, config.features, size)
+        found = estimate(clip, encoders.dino if config.uses_dino else None, config.features, size)
         progress(Event("encoders", 4, 4))
         facts["time"] = {
             "device": config.encoder_device,

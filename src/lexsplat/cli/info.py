@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from lexsplat.cli.options import SceneArgument, open_folder, print_json
+from lexsplat.cli.waiting import starting
 
 
 @dataclasses.dataclass
@@ -21,7 +22,8 @@ class Info:
 
     def run(self) -> None:
         """Print the facts."""
-        from lexsplat.scenes.facts import NO_SEGMENTS, scene_facts
+        with starting():
+            from lexsplat.scenes.facts import NO_SEGMENTS, scene_facts
 
         facts = scene_facts(open_folder(self.scene))
         if self.json:

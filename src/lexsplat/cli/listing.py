@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lexsplat.cli.options import Device, SceneArgument, open_scene, print_json
+from lexsplat.cli.waiting import starting
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -58,7 +59,8 @@ class List:
 
     def run(self) -> None:
         """List and print."""
-        from lexsplat.scenes.objects import list_document, read_vocabulary
+        with starting():
+            from lexsplat.scenes.objects import list_document, read_vocabulary
 
         names = read_vocabulary(self.vocabulary) if self.vocabulary else []
         scene = open_scene(self.scene, self.device, self.clip)

@@ -14,10 +14,15 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import tyro
 
 from lexsplat.cli.options import Device
+from lexsplat.cli.waiting import LateProgress, starting
 from lexsplat.runtime.errors import BackendError, LibraryError
+from lexsplat.runtime.progress import uncounted
 
 if TYPE_CHECKING:
     import socket
+
+    from lexsplat.scenes.library import Library
+    from lexsplat.scenes.serving import OpenScene
 
 Scenes = tyro.conf.Positional[
     Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE ...", help_behavior_hint="(required)")]
@@ -82,19 +87,13 @@ class Mcp:
             self._serve(listening)
 
     def _serve(self, listening: socket.socket | None) -> None:
-        from lexsplat.mcp.server import make_server, serve_http
-        from lexsplat.mcp.writing import check_output
-        from lexsplat.scenes.library import open_library
-        from lexsplat.scenes.serving import open_scenes
+        with starting():
+            from lexsplat.mcp.server import make_server, serve_http
+            from lexsplat.mcp.writing import check_output
 
         if self.allow_write:
             check_output(self.output.resolve())
-        libraries = [path for path in self.scenes if (Path(path) / "library.json").is_file()]
-        if len(libraries) > 1:
-            raise LibraryError(libraries[1], expected="one library", found=str(len(libraries)))
-        library = open_library(libraries[0], device=self.device) if libraries else None
-        alone = [path for path in self.scenes if path not in libraries]
-        scenes = open_scenes(alone, self.device, self.clip)
+        scenes, library = self._open()
         server = make_server(scenes, self.output.resolve() if self.allow_write else None, library)
         for served in scenes.values():  # meanwhile the client connects; the process ends after them
             threading.Thread(target=served.warm).start()
@@ -108,3 +107,19 @@ class Mcp:
         # Nothing else ends the thread that waits for the client's next line.
         signal.signal(signal.SIGINT, lambda *_: os._exit(0))
         server.run()
+
+    def _open(self) -> tuple[dict[str, OpenScene], Library | None]:
+        """The scenes by name, and the library; both show progress on standard error, never on standard output."""
+        from lexsplat.scenes.library import open_library
+        from lexsplat.scenes.serving import open_scenes
+
+        libraries = [path for path in self.scenes if (Path(path) / "library.json").is_file()]
+        if len(libraries) > 1:
+            raise LibraryError(libraries[1], expected="one library", found=str(len(libraries)))
+        listener, library = LateProgress(), None
+        if libraries:
+            with uncounted(listener, "library"):
+                library = open_library(libraries[0], device=self.device)
+            library.listener = listener
+        alone = [path for path in self.scenes if path not in libraries]
+        return open_scenes(alone, self.device, self.clip, listener), library

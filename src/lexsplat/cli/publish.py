@@ -10,6 +10,7 @@ from typing import Annotated, ClassVar
 import tyro
 
 from lexsplat.cli.options import Device, SceneArgument, open_scene
+from lexsplat.cli.waiting import starting
 
 FolderArgument = tyro.conf.Positional[
     Annotated[Path, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(required)")]
@@ -61,7 +62,8 @@ class Publish:
 
     def run(self) -> None:
         """Write the page."""
-        from lexsplat.scenes.publishing import PublishOptions, check_target, publish
+        with starting():
+            from lexsplat.scenes.publishing import PublishOptions, check_target, publish
 
         check_target(self.folder, self.single_file)  # before anything is loaded
         options = PublishOptions(

@@ -7,6 +7,7 @@ import math
 
 from lexsplat.cli.options import Device, SceneArgument, open_folder, open_scene, print_json
 from lexsplat.cli.values import Length
+from lexsplat.cli.waiting import starting
 
 
 @dataclasses.dataclass
@@ -64,8 +65,9 @@ class Scale:
 
     def run(self) -> None:
         """Measure, store and print."""
-        from lexsplat.geometry.world import parse_vector, world_of
-        from lexsplat.scenes.scale import store_world
+        with starting():
+            from lexsplat.geometry.world import parse_vector, world_of
+            from lexsplat.scenes.scale import store_world
 
         folder = open_folder(self.scene)
         length, scale = None, None

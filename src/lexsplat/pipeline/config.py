@@ -46,7 +46,8 @@ class BuildConfig:
     Args:
         clip: Image-text encoder: a name on the Hugging Face Hub, a folder, or "bundled" (small, for scenes like the
             demo).
-        dino: Dense encoder: a name, a folder, "bundled", or "none".
+        dino: Dense encoder: a name, a folder, "bundled", or "none". Method "trained" uses it, and "averaged" where
+            CLIP is read at class tokens alone (``features.crop_tokens``).
         device: Device to compute on; "auto" takes CUDA if there is a GPU.
         encoder_device: Device of the encoders; "auto" takes that of the rasterizer. With a CPU rasterizer, "cuda" or
             "mps" (the GPU of a Mac) speeds up the features.

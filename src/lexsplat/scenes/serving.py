@@ -89,7 +89,9 @@ class OpenScene:
         return (facts.st_mtime_ns, facts.st_size)
 
 
-def open_scenes(paths: Sequence[str], device: str = "auto", clip: str | None = None) -> dict[str, OpenScene]:
+def open_scenes(
+    paths: Sequence[str], device: str = "auto", clip: str | None = None, listener: Listener = silent
+) -> dict[str, OpenScene]:
     """Several scenes by the names of their folders; a number is added to a name that occurs twice."""
     found: dict[str, OpenScene] = {}
     for path in paths:
@@ -97,7 +99,7 @@ def open_scenes(paths: Sequence[str], device: str = "auto", clip: str | None = N
         number = 2
         while name in found:
             name, number = f"{base}-{number}", number + 1
-        found[name] = OpenScene(path, device, clip)
+        found[name] = OpenScene(path, device, clip, listener)
     return found
 
 
