@@ -48,7 +48,8 @@ def test_texts_are_encoded_one_by_one_and_the_cache_is_written_once(tmp_path, mo
 
     from lexsplat.features import text
 
-    def write(path, tensors, metadata):
+    def write(path, tensors, metadata, lasting):
+        assert not lasting, "a cache may be lost with the power"
         written.append(len(tensors["embeddings"]))
 
     monkeypatch.setattr(text, "write_tensors", write)

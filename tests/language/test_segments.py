@@ -132,6 +132,7 @@ def test_segments_are_stored_with_the_language_in_4_bytes_a_gaussian():
         ("labels", torch.tensor([0, 1])),
         ("masses", torch.tensor([0.5, -1, 2, 9])),
         ("levels", torch.tensor([[0, 1, 7]])),
+        ("levels", torch.zeros(0, 3, dtype=torch.int64)),
         ("levels", None),
     ],
 )

@@ -94,15 +94,29 @@ def test_recoloring_changes_hue_and_keeps_shading(base):
     thing = scene.gaussians.select(torch.from_numpy(labels == 0))
     shade = torch.linspace(-1.0, 0.5, 30)
     thing = replace(thing, sh0=shade[:, None, None].expand(30, 1, 3).clone())
-    red = recolored(thing, (0.8, 0.2, 0.1), 1.0)
+    red = recolored(thing, (0.6, 0.15, 0.1), 1.0)
     color = red.sh0[:, 0] * 0.28209479177387814 + 0.5
     shares = thing.opacities / thing.opacities.sum()
-    assert torch.allclose((color * shares[:, None]).sum(0), torch.tensor([0.8, 0.2, 0.1]), atol=1e-4)
+    assert torch.allclose((color * shares[:, None]).sum(0), torch.tensor([0.6, 0.15, 0.1]), atol=1e-4)
     assert torch.allclose(color[:, 0] / color[:, 1], torch.full((30,), 4.0), rtol=1e-3)
     old = shade * 0.28209479177387814 + 0.5
     assert torch.allclose(color[:, 0] / color[0, 0], old / old[0], rtol=1e-3)
     assert not red.shN.any()
     assert torch.allclose(recolored(thing, (0.8, 0.2, 0.1), 0.0).sh0, thing.sh0, atol=1e-6)
+
+
+def test_recolored_highlights_keep_their_luminance_and_turn_pale(base):
+    scene, labels = base
+    thing = scene.gaussians.select(torch.from_numpy(labels == 0))
+    shade = torch.linspace(-1.0, 1.5, 30)
+    thing = replace(thing, sh0=shade[:, None, None].expand(30, 1, 3).clone())
+    blue = recolored(thing, (0.1, 0.3, 0.9), 1.0).sh0[:, 0] * 0.28209479177387814 + 0.5
+    assert float(blue.max()) <= 1 + 1e-5
+    luminance = blue @ torch.tensor([0.2126, 0.7152, 0.0722])
+    old = shade * 0.28209479177387814 + 0.5
+    assert torch.allclose(luminance / luminance[0], old / old[0], rtol=1e-3)
+    saturation = 1 - blue[:, 0] / blue[:, 2]
+    assert saturation[-1] < saturation[0] - 0.1
 
 
 @given(st.lists(st.sampled_from(["delete", "recolor", "move", "duplicate", "undo", "redo"]), max_size=9))

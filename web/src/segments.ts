@@ -98,10 +98,10 @@ export class Segments {
       mass += masses[i];
       certain += masses[i] * this.#certainties[i];
     }
-    const usual = Math.max(certain / Math.max(mass, 1e-12), 1e-6);
+    const usual = certain / Math.max(mass, 1e-12);
     const scores = new Float32Array(own.length);
     for (let i = 0; i < own.length; i++) {
-      const counted = own[i] * share * Math.min(this.#certainties[i] / usual, most);
+      const counted = own[i] * share * (usual > 1e-6 ? Math.min(this.#certainties[i] / usual, most) : 1);
       const odds = Math.min(60, Math.max(-60, counted * slope + shared[labels[i]]));
       scores[i] = floor[labels[i]] + (below * (1 - threshold)) / (1 + Math.exp(-odds));
     }

@@ -174,7 +174,7 @@ class _Store:
         try:
             stored = torch.stack(list(known.values()))
             facts = {"texts": json.dumps(list(known)), "width": str(width)}
-            write_tensors(self._path(content_hash), {"embeddings": stored}, facts)
+            write_tensors(self._path(content_hash), {"embeddings": stored}, facts, lasting=False)
         except OSError as error:  # the cache is optional
             log.warning("%s: text embeddings are not cached (%s)", self._folder, error.strerror)
 

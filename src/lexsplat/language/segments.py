@@ -71,6 +71,8 @@ class Segments:
                 f"labels [N], masses [N] and levels [L, S] expected, got {list(self.labels.shape)}, "
                 f"{list(self.masses.shape)}, {list(self.levels.shape)}"
             )
+        if self.labels.numel() and not self.levels.numel():
+            raise ValueError("segments of Gaussians need a level")
         for name, values in (("labels", self.labels), ("levels", self.levels)):
             if values.numel() and not 0 <= int(values.min()) <= int(values.max()) < self.levels.shape[1]:
                 raise ValueError(f"{name} must be in 0..{self.levels.shape[1] - 1}")

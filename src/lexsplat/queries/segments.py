@@ -40,6 +40,8 @@ MOST_CERTAIN = 2.0
 """Largest factor of an own relevancy for the agreement of the views."""
 BELOW = 1 - 2.0**-20
 """Factor that keeps the largest score of a segment that is left below `SEGMENT_THRESHOLD` in single precision."""
+_NEVER = 1e-6
+"""Mean certainty of what is taken up to which it counts for nothing: the views agree nowhere."""
 
 FloatArray = NDArray[np.float64]
 
@@ -102,7 +104,8 @@ def segment_relevancy(relevancy: Tensor, segments: Segments, uncertainties: Tens
         odds = own[prompt] * np.float32(OWN_SHARE)
         if certainties is not None:
             usual = certain[taken].sum() / max(masses[taken].sum(), 1e-12)
-            odds *= np.minimum(certainties / np.float32(max(usual, 1e-6)), np.float32(MOST_CERTAIN))
+            if usual > _NEVER:
+                odds *= np.minimum(certainties / np.float32(usual), np.float32(MOST_CERTAIN))
         odds += ((1 - OWN_SHARE) * at_lowest - limit).astype(np.float32)[labels]
         odds *= np.float32(-STEEPNESS / spread)
         steep = np.exp(np.clip(odds, -60, 60, out=odds), out=odds)

@@ -28,19 +28,25 @@ _TEMPORARY = re.compile(r"\..*\.(\d+)\.\d+\.tmp")
 
 
 @contextlib.contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path, lasting: bool = True) -> Iterator[Path]:
     """A temporary path beside ``path`` that replaces it when the block ends without an error.
 
     Readers see the old file or the new one, never a part. The data reach the disk before the name changes. Missing
     folders are created. Threads and processes may write the same file at once; the last one wins. Errors of the
     system name ``path``.
+
+    Args:
+        path: The file.
+        lasting: Whether the data must outlast a loss of power, which takes milliseconds; a cache that is checked when
+            it is read need not.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{get_ident()}.tmp")
     try:
         yield temporary
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
+        if lasting:
+            with open(temporary, "rb") as file:
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
         if error.filename == str(temporary):
@@ -188,14 +194,16 @@ _DIGEST = "content"
 """Metadata entry with a hash of the tensors; files of other programs lack it and are not checked."""
 
 
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Write named tensors and string metadata as safetensors, with a hash of the tensors.
+def write_tensors(
+    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str], lasting: bool = True
+) -> None:
+    """Write named tensors and string metadata as safetensors, with a hash of the tensors (`atomic_path`).
 
     Raises:
         OSError: If they cannot be written, for example on a full disk; an existing file stays.
     """
     contiguous = {name: tensor.detach().to("cpu").contiguous() for name, tensor in tensors.items()}
-    with atomic_path(path) as temporary:
+    with atomic_path(path, lasting) as temporary:
         save_tensors(contiguous, temporary, {**metadata, _DIGEST: _digest(contiguous)})
 
 

@@ -90,7 +90,8 @@ def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> 
 
     Args:
         gaussians: The Gaussians of an object.
-        color: Mean RGB in 0..1 afterwards (unless it clips).
+        color: Mean RGB in 0..1 afterwards, where none would be brighter than 1: such parts are mixed with gray of
+            their luminance, as highlights are.
         strength: 0 changes nothing, 1 removes the old hue and the view-dependent color.
 
     Raises:
@@ -105,9 +106,13 @@ def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> 
         return gaussians
     target = target.to(gaussians.sh0)
     old = gaussians.sh0[:, 0] * SH_C0 + 0.5
-    light = (old.clamp(0, 1) @ torch.tensor(_LUMINANCE).to(old)).clamp_min(0.02)
+    weights = torch.tensor(_LUMINANCE).to(old)
+    light = (old.clamp(0, 1) @ weights).clamp_min(0.02)
     shares = gaussians.opacities / gaussians.opacities.sum().clamp_min(1e-12)
     new = target * (light / (light * shares).sum())[:, None]
+    gray = (new @ weights)[:, None].clamp_max(1)
+    room = (1 - gray) / (new.amax(1, keepdim=True) - gray).clamp_min(1e-6)
+    new = gray + room.clamp_max(1) * (new - gray)
     mixed = (1 - strength) * old + strength * new
     sh0 = ((mixed - 0.5) / SH_C0)[:, None]
     return replace(gaussians, sh0=sh0, shN=gaussians.shN * (1 - strength))
