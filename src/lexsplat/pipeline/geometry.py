@@ -28,7 +28,7 @@ from lexsplat.scenes.folder import SceneFolder
 
 @dataclass(frozen=True)
 class GeometryRun:
-    """What a way reads beside the settings.
+    """Inputs of a `Geometry` in addition to the settings.
 
     Args:
         capture: The capture at the size to work at.
@@ -63,13 +63,13 @@ class Geometry:
     """A way to the Gaussians of a build: one reconstruction of the whole capture, where no other is asked for."""
 
     def inputs(self, config: BuildConfig, device: str) -> list[Any]:
-        """What its Gaussians depend on beside photos and cameras; the name of a stage stands for its inputs."""
+        """Inputs of the Gaussians other than photos and cameras. The name of a stage stands for its inputs."""
         fit = config.reconstruction
         rates = [fit.scale_of_rates] if fit.cooled_share else []  # a default that no setting holds
         return [fit, *rates, config.seed, device]
 
     def outputs(self, checkpoints: Path) -> list[Path]:
-        """What it writes beside the Gaussians."""
+        """Files that it writes in addition to the Gaussians."""
         return []
 
     def make(self, config: BuildConfig, run: GeometryRun) -> tuple[Gaussians, dict[str, Any]]:

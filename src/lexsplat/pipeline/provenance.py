@@ -65,8 +65,8 @@ def write_provenance(folder: SceneFolder, capture: Capture, config: BuildConfig)
 def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]) -> None:
     """Store the up direction, of the user, the cameras, or the splats from which views were chosen.
 
-    Chosen views are level with the up direction of the splats: what is estimated from them looks certain even where
-    that is a guess. A scale stored for other cameras is dropped.
+    Chosen views are level with the up direction assumed for the splats. An estimate from them would confirm that
+    direction even if it is a guess. A scale stored for other cameras is dropped.
     """
     record = folder.record
     world = world_of(record, cameras)

@@ -102,7 +102,7 @@ MAX_LENGTH = 600
 
 
 class _IncompleteError(Exception):
-    """A phrase lacks a part; the text of the error is the word that asks for it."""
+    """A phrase is incomplete. The message is the word that is not understood, such as an "on" at its end."""
 
 
 def parse(text: str) -> Phrase:

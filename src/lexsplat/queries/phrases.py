@@ -165,7 +165,7 @@ class Pick:
 
 @dataclass(frozen=True)
 class AtLeast:
-    """All instances of ``target`` if there are as many as asked for, and at most ``most`` if that is given."""
+    """All instances of ``target`` if there are at least ``count``, and at most ``most`` if given; otherwise none."""
 
     count: int
     target: Phrase

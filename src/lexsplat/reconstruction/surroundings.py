@@ -78,7 +78,7 @@ def extents_of(gaussians: Gaussians) -> NDArray[np.float32]:
 
 
 def shares_in_images(cameras: Sequence[Camera], extents: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Chance ``[C, N]`` of Gaussians to take part in images: their area over that of `SMALL`, at most 1.
+    """Probability ``[C, N]`` that a Gaussian is used in an image: its area over that of `SMALL`, at most 1.
 
     It is 0 outside of an image. Gaussians reach three deviations far; some that are just outside count as inside.
     """

@@ -43,6 +43,6 @@ class Bounded(Generic[K, V]):
             return kept
 
     def get_or_make(self, key: K, make: Callable[[], V]) -> V:
-        """The entry; made outside the lock where there is none."""
+        """Return the entry; if missing, create it outside the lock."""
         found = self.get(key)
         return self.put(key, make()) if found is None else found

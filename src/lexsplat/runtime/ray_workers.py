@@ -115,7 +115,7 @@ class RayWorkers:
         """See `Workers.map`. Tasks are sent while slots are free, though an earlier one is still at work.
 
         Raises:
-            WorkersError: If the cluster disappears, or no node has what a task needs, also after a wait.
+            WorkersError: If the cluster disappears, or even after a wait no node has what a task needs.
         """
         import ray
 

@@ -51,7 +51,7 @@ class Outcome:
     Args:
         name: Name of its item.
         result: What it returned; None if it failed.
-        error: Why it failed, for a reason of its own. A lost worker is no such reason: the task is done again.
+        error: Why the task itself failed. A lost worker is not a failure: the task is repeated.
     """
 
     name: str

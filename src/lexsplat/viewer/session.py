@@ -252,7 +252,7 @@ class Session:
                 self._change(action, named, values)
         except ValueError as error:  # numbers that have no meaning for these Gaussians
             raise QueryError(
-                action, expected="Gaussians that can be drawn afterwards", found=str(error)
+                action, expected="Gaussians that can be drawn after the edit", found=str(error)
             ) from error
         except OSError as error:
             raise SceneFolderError(

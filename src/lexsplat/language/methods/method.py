@@ -133,7 +133,7 @@ class JointMethod(LanguageMethod, Protocol):
     """A method that trains the geometry, too (``--joint``). Its `fit` takes the language that `fit_geometry` kept."""
 
     def geometry_inputs(self, config: Any) -> list[Any]:
-        """What its Gaussians depend on beside the reconstruction; the name of a stage stands for its inputs."""
+        """Inputs of its Gaussians in addition to the reconstruction's; the name of a stage stands for its inputs."""
 
     def geometry_outputs(self, scratch: Path) -> list[Path]:
         """Files in which `fit_geometry` keeps the language."""

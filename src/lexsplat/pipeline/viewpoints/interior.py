@@ -1,7 +1,7 @@
 """Whether splats are a room, to be looked at from inside, or an object, to be looked at from around.
 
-A room is closed all around its free places, and holds things. What mesh converters make of a ball or of a crate is
-closed, too, but empty: from any place inside, all that is seen is the convex shell around that place.
+A room is closed all around its free places, and holds things. A ball or crate from a mesh converter is also closed,
+but empty: from any place inside, only the convex shell around that place is seen.
 """
 
 from __future__ import annotations

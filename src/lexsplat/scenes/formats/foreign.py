@@ -151,9 +151,9 @@ def _turned(quats: Tensor, path: Path) -> Tensor:
 
 
 def _near(gaussians: Gaussians, path: Path) -> Gaussians:
-    """The Gaussians without those so far out or so large that cameras around them are beyond `MAX_COORDINATE`.
+    """Drop Gaussians so distant or large that a camera around them would exceed `MAX_COORDINATE`.
 
-    Coordinates of a map, which are millions of meters from their origin, stay.
+    Map coordinates, millions of meters from their origin, are kept.
 
     Raises:
         FileFormatError: If they are more than `MOST_DROPPED` of them.

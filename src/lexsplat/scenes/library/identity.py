@@ -115,7 +115,7 @@ def listed_records(root: Path, new: bool) -> list[os.DirEntry[str]]:
             (stage if root.is_dir() else root).absolute(),
             expected="the library that was opened",
             found="no such folder: it was moved or deleted",
-            remedy="put it back, or start again with its new place",
+            remedy="restore the folder, or open the library at its new path",
         ) from error
     return sorted(found, key=lambda each: each.name[:-5])
 

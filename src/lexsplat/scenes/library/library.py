@@ -241,7 +241,7 @@ class Library:
 
         Raises:
             ModelError: If the encoder cannot be loaded.
-            LibraryError: If it is not the one of the scenes.
+            LibraryError: If the encoder is not the one that the scenes were built with.
         """
         if not content_hash:
             return torch.cat([self._tower(clip).encode_text([text]) for text in texts])

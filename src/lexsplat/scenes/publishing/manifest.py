@@ -103,7 +103,7 @@ def colored_entries(scene: Scene, objects: Sequence[Selection]) -> list[dict[str
 
 
 def kind_entries(objects: Sequence[Selection]) -> dict[str, list[int]]:
-    """The places of a scene's objects that each kind holds, by every text that names the kind; "" is any thing."""
+    """Indices of the objects of each kind, keyed by every name of the kind; "" is any thing."""
     found = {
         text: [place for place, each in enumerate(objects) if is_of_kind(each.phrase, text)]
         for text in KIND_PHRASES
