@@ -70,7 +70,7 @@ class Row:
 
     Args:
         name: Name of the method or variant.
-        settings: Everything the language depends on beside seed and shared stages: dataclasses and plain data.
+        settings: Everything the language depends on except seed and shared stages: dataclasses and plain data.
         make: Makes the language of a seed.
         form: How codes and text are compared.
     """

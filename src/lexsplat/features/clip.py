@@ -129,7 +129,7 @@ class ClipEncoder(PretrainedModel):
         return found
 
     def text_only(self, device: torch.device | str) -> ClipText | ClipEncoder:
-        """What answers texts as `load_text` of this model does, without loading it again.
+        """The text tower of this model as `load_text` returns it, without loading the model again.
 
         Of other architectures than CLIP's own it is this encoder, which gives its image tower away.
         """

@@ -34,7 +34,7 @@ _LEGACY_END = 2
 """An end token of this number stands for the largest number in the prompt, as in OpenAI's code."""
 _MOST_LAYERS = 1000
 UNLIKE = 1e-5
-"""Distance of two unit vectors that are equal but for rounding."""
+"""Largest distance of two unit vectors that are equal up to rounding."""
 UNLIKE_WORDS = ("an apple", "a wooden table", "blue sky", "a car")
 """Words to which every encoder gives different embeddings."""
 

@@ -117,7 +117,7 @@ def local_folder(name: str, tower: str) -> Path | None:
 
 
 def missing_part(folder: Path, tower: str) -> str:
-    """What a folder lacks to be a model, in words; "" if nothing."""
+    """Name of a file that a model folder lacks; "" if it is complete."""
     if not (folder / "config.json").is_file():
         return "config.json"
     if not weight_files(folder):

@@ -28,7 +28,7 @@ _MAX_LENGTH = 1_000
 
 
 class TextTower(Protocol):
-    """What questions need of an encoder."""
+    """Text side of an encoder, which is all that queries need."""
 
     content_hash: str
 

@@ -73,7 +73,7 @@ class Encoders:
 
     @cached_property
     def segmenter(self) -> Segmenter | None:
-        """What finds 2D segments; None if features are not pooled by them."""
+        """The source of 2D segments; None if features are not pooled by segments."""
         return None if self._segments == "none" else load_segmenter(self._segments, self.device)
 
     def keep_text(self, device: str) -> None:

@@ -59,7 +59,7 @@ _WHOLE = 0.5
 
 @dataclass(frozen=True)
 class Searched:
-    """What a phrase is evaluated on.
+    """The scene as the evaluation of a phrase sees it.
 
     Args:
         select: The selection of a thing, by its text.

@@ -1,4 +1,4 @@
-"""What the grammar leaves in a thing although it names no thing: function words, numbers, comparisons, places.
+"""Words that the grammar leaves over and that name no thing: function words, numbers, comparisons, places.
 
 The words are of closed classes, so the rule holds for phrasings that nobody has thought of. A fixed noun phrase keeps
 its words: "cup of tea", "mug with a handle", "something to sit on", "table with four legs".

@@ -1,4 +1,4 @@
-"""What a phrase asks for: things, and the relations between them. `lexsplat.queries.grammar` parses text into it."""
+"""Parsed phrases: things, and the relations between them. `lexsplat.queries.grammar` parses text into them."""
 
 from __future__ import annotations
 

@@ -179,7 +179,7 @@ class PresenceClassifier:
 
     @property
     def tables(self) -> dict[str, Tensor]:
-        """What published pages need: distributions ``[V, K]`` of objects, and the best heights for colors ``[K]``."""
+        """Tables for pages: distributions ``[V, K]`` of objects, and the best heights for colors ``[K]``."""
         return {"places": self.places.distributions, "best_colored": self._best_colored}
 
     def strengths(self, texts: Tensor, places: Tensor) -> NDArray[np.float64]:

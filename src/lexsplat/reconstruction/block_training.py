@@ -96,7 +96,7 @@ class BlockRun:
 
 @dataclass(frozen=True)
 class _Shared:
-    """What the visits of a group read."""
+    """Inputs shared by the visits of a group."""
 
     capture: Capture
     config: ReconstructionConfig
@@ -294,7 +294,7 @@ def reconstruct_blocks(
 
 
 def _seen_by(group: list[Visit], capture: Capture) -> Capture:
-    """What workers need of the capture: the views of a group of visits."""
+    """The part of the capture that workers need: the views of a group of visits."""
     views = {name: capture.views[name] for visit in group for name in visit.block.views}
     none, colors = capture.points[:0], capture.point_colors[:0]
     names = tuple(sorted(views))
@@ -388,7 +388,7 @@ def _trained(shared: _Shared, visit: Visit) -> int:
     after = {cell: state.select(torch.from_numpy(cells == cell)) for cell in block.trained}
     files.write(visit.number, after, exposures)
     del trainer, around, state, after
-    budget.give_back_freed()  # what the next visit gets would otherwise lie beside it
+    budget.give_back_freed()  # otherwise the next visit's memory would come on top of it
     return len(cells)
 
 

@@ -99,7 +99,7 @@ def _counts(config: ReconstructionConfig, start: int, cap: int) -> NDArray[np.fl
 
 
 def _grown(points: InitialPoints, count: int) -> InitialPoints:
-    """As many points as there may be Gaussians: copies beside the given ones, at about their distance."""
+    """As many points as there may be Gaussians: copies near the given ones, at about their distance."""
     repeats = max(1, -(-count // len(points.points)))
     generator = np.random.default_rng(0)
     spread = 0.01 * points.points.std(0)

@@ -26,7 +26,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Needs:
-    """What one task needs of the machine that it runs on.
+    """Resources that one task needs.
 
     Args:
         memory: Host memory in bytes; 0 leaves it to the engine.

@@ -1,4 +1,4 @@
-"""What every compared method is: an object behind the protocol `Baseline`."""
+"""The protocol of compared methods, `Baseline`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Baseline(Protocol):
 
     @property
     def settings(self) -> Any:
-        """Everything beside the seed that decides what `fit` makes; None if nothing does."""
+        """Everything except the seed that the result of `fit` depends on; None if nothing."""
 
     @property
     def knows_prompts(self) -> bool:

@@ -36,7 +36,7 @@ LevelMaps = Callable[[str], tuple[Tensor, list[float]]]
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What the compared methods are fitted to.
+    """Training data of the compared methods.
 
     Args:
         gaussians: The geometry.

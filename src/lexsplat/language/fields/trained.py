@@ -154,7 +154,7 @@ class TrainedField(nn.Module):
 
     @torch.no_grad()
     def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
-        """Eq. 8 ``[H, W, K]``. Every pixel sums to 1, also where no Gaussian is drawn (there s is 0)."""
+        """Eq. 8 ``[H, W, K]``. Every pixel sums to 1, even where no Gaussian is drawn (there s is 0)."""
         semantics, _ = self.render_semantics(gaussians, camera)
         return self._probabilities(semantics.flatten(0, 1)).unflatten(0, semantics.shape[:2])
 

@@ -97,7 +97,7 @@ def all_valid(name: str, size: tuple[int, int]) -> None:
     """The `Valid` of views without masks."""
 
 
-# Beside its inputs: masks, and three options of the run that tests leave out.
+# In addition to its inputs: masks, and three options of the run that tests leave out.
 def average_features(
     gaussians: Gaussians,
     cameras: Mapping[str, Camera],
@@ -213,7 +213,7 @@ class _Shards(Mapping[str, _Shard]):
 
 @dataclass(frozen=True)
 class _Averaging:
-    """What the sums of every shard are made from: arguments of `average_features`."""
+    """Inputs shared by the sums of all shards: arguments of `average_features`."""
 
     gaussians: Gaussians
     cameras: Mapping[str, Camera]
@@ -255,7 +255,7 @@ def _shard_sums(shared: _Averaging, item: _Shard) -> tuple[Tensor, Tensor, int]:
 
 
 def _features(found: FeatureMap, with_dino: int) -> Tensor:
-    """What is averaged of a view ``[h, w, L (Dc + Dd)]``: CLIP and DINO features of each level."""
+    """The features of a view to average ``[h, w, L (Dc + Dd)]``: CLIP and DINO features of each level."""
     levels = found.levels or (found,)
     halves = ((level.clip, level.dino) if with_dino else (level.clip,) for level in levels)
     parts = [half for pair in halves for half in pair if half is not None]

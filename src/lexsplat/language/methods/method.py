@@ -101,18 +101,18 @@ class LanguageMethod(Protocol):
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """Parts of the build settings that decide what `fit` makes, beside the seed."""
+        """Parts of the build settings that the result of `fit` depends on, in addition to the seed."""
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Stages before "language" that it needs beside the Gaussians, in order."""
+        """Stages before "language" that it needs in addition to the Gaussians, in order."""
 
     @property
     def stages(self) -> tuple[str, ...]:
         """All stages of a build, in the order in which they run."""
 
     def uses_dino(self, config: Any) -> bool:
-        """Whether DINO features take part in a build of these settings."""
+        """Whether a build of these settings uses DINO features."""
 
     @property
     def variants(self) -> Mapping[str, Variant]:

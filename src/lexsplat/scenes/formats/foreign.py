@@ -61,7 +61,7 @@ def damaged(path: Path, expected: str, found: str, remedy: str = AGAIN) -> FileF
 
 
 class Damage(ValueError):
-    """What is wrong with the content of a file, in words for its user."""
+    """The content of a file is damaged; the message is for its user."""
 
 
 def reason(error: Exception) -> str:
@@ -92,7 +92,7 @@ def parsing(path: Path, expected: str, *further: type[Exception]) -> Iterator[No
 
 @contextlib.contextmanager
 def warnings_once() -> Iterator[None]:
-    """What is read more than once in this block is warned of once."""
+    """Give each warning once in this block, even if a file is read twice."""
     token = _logged.set(set())
     try:
         yield

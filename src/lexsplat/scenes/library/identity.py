@@ -141,7 +141,7 @@ def _damaged(root: Path, expected: str, found: str) -> _DamagedError:
 
 
 def _mending(root: Path, otherwise: str) -> str:
-    """What repairs a lost or damaged ``library.json`` beside entries; another remedy where there are none."""
+    """The remedy for a lost or damaged ``library.json``: repair if there are entries, else ``otherwise``."""
     repair = command("verify", root, "--repair")
     mending = f"{repair} writes it again; an index server has to be filled again"
     return mending if has_entries(root) else otherwise

@@ -97,7 +97,7 @@ class _KeptPresence(PresenceClassifier):
 
 @functools.cache
 def _one_gaussian() -> Gaussians:
-    """What stands for geometry where rules read none."""
+    """A placeholder for the geometry, which no rule reads."""
     return gaussians_from_points(np.zeros((1, 3)), np.zeros((1, 3)), sh_degree=0, opacity=0.5)
 
 

@@ -1,4 +1,4 @@
-"""What a page knows of its scene before it reads a file: ``manifest.json``."""
+"""``manifest.json``, the first file that a page reads."""
 
 from __future__ import annotations
 
