@@ -267,6 +267,7 @@ def test_the_overview_lists_every_command(capsys):
     for name, entry in cli.COMMANDS.items():
         assert f"  {name} " in page
         assert entry.summary in page
+    assert "lexsplat COMMAND --help-all   all options\n" in page
 
 
 def help_page(capsys, *arguments: str) -> str:
