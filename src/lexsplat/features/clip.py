@@ -180,7 +180,7 @@ class ClipEncoder(PretrainedModel):
         return {key: tokens[key].to(self.device) for key in keys}
 
     def tokens_over(self, prompt: str) -> int:
-        """How many tokens of a prompt are more than the model reads, and so cut."""
+        """Number of tokens by which a prompt exceeds the limit of the model and is truncated."""
         if len(prompt) + 2 <= self._text_length:  # a token but start and end has at least one character
             return 0
         return max(len(self._tokenizer(prompt, verbose=False)["input_ids"]) - self._text_length, 0)

@@ -192,7 +192,7 @@ class ClipText:
         return F.normalize(x[0, int(end.argmax())] @ weights["text_projection.weight"].T, dim=-1).cpu()
 
     def tokens_over(self, prompt: str) -> int:
-        """How many tokens of a prompt are more than the model has positions, and so cut."""
+        """Number of tokens by which a prompt exceeds the positions of the model and is truncated."""
         return max(len(self._tokenizer.encode(prompt).ids) - self._limit, 0)
 
     def _tokens(self, prompt: str) -> Tensor:

@@ -1,4 +1,4 @@
-"""How long the encoders take for one photo, measured before a long build."""
+"""Time estimate of the encoders for one photo, measured before a long build."""
 
 from __future__ import annotations
 

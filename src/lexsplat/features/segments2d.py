@@ -190,7 +190,7 @@ def _png_numbers(path: Path) -> NDArray[np.int32]:
 
 
 def check_segments(config: FeatureConfig, capture: Capture) -> None:
-    """Refuse what can be known about segments before anything that takes time; models are checked when loaded.
+    """Refuse unusable segments before anything that takes time; models are checked when loaded.
 
     Args:
         config: Settings of the features.

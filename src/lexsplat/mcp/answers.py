@@ -80,7 +80,7 @@ class Asked(Certainty):
 
 
 class Counted(World, Asked):
-    """How many."""
+    """The number of things."""
 
     phrase: str
     count: Count

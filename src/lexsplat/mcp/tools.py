@@ -355,7 +355,7 @@ class LibraryTools(Tools):
 
 
 def _one_of(arguments: dict[str, Any]) -> None:
-    """Refuse two arguments of which each takes the place of the other, and none of them."""
+    """Refuse both or neither of two alternative arguments."""
     given = [name for name, value in arguments.items() if value]
     if len(given) != 1:
         first, second = arguments

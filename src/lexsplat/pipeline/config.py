@@ -182,7 +182,7 @@ class BuildConfig:
         return (JOINT_METHODS if self.joint else METHODS)[self.method]
 
     def refuse_beside_splats(self) -> None:
-        """Refuse settings that make Gaussians of their own where Gaussians are given.
+        """Refuse settings of the reconstruction if Gaussians are given.
 
         Raises:
             ValueError: If they do.
@@ -209,7 +209,7 @@ class BuildConfig:
         )
 
     def resolved(self, device: str, capture_size: tuple[int, int]) -> BuildConfig:
-        """The same settings with every open one chosen.
+        """The same settings with every open choice made.
 
         What depends on the architecture of CLIP is chosen by its configuration, so the model has to be on this
         machine (`lexsplat.features.hub.model_folder`).

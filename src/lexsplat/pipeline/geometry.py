@@ -1,4 +1,4 @@
-"""The ways to the Gaussians of a build, each an object: whole, in blocks, with language, or of another program.
+"""The ways to the Gaussians of a build, each an object: in one piece, in blocks, jointly with language, or given.
 
 They are the work of the stage "reconstruct". `way_to_geometry` chooses one by the settings.
 """
@@ -48,7 +48,7 @@ class GeometryRun:
 
     @property
     def checkpoints(self) -> Path:
-        """Where a way keeps what the next run resumes from."""
+        """Folder of the files from which the next run resumes."""
         return self.folder.root / "checkpoints"
 
     def initial_points(self) -> InitialPoints:
@@ -138,7 +138,7 @@ class _WithLanguage(Geometry):
 
 @dataclass(frozen=True)
 class _Given(Geometry):
-    """The Gaussians of another program, if they show what the photos show."""
+    """The Gaussians of another program, if their renders agree with the photos."""
 
     path: Path
 
@@ -154,7 +154,7 @@ class _Given(Geometry):
 
 
 def way_to_geometry(config: BuildConfig, device: str, splats: Path | None) -> Geometry:
-    """The way that the settings ask for; given splats come before all others."""
+    """The way that the settings select; given splats take precedence."""
     if splats is not None:
         return _Given(splats)
     if config.joint:

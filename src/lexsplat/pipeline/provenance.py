@@ -1,4 +1,4 @@
-"""Where a scene comes from: the record of its inputs, and fingerprints that detect changes."""
+"""Provenance of a scene: the record of its inputs, and fingerprints that detect changes."""
 
 from __future__ import annotations
 

@@ -310,7 +310,7 @@ def in_place_of(second: Phrase, first: Phrase) -> Phrase:
 
 
 def loosened(phrase: Phrase, together: bool) -> Phrase:
-    """The phrase with the union in place of `Together`, but where a whole question asks for both."""
+    """The phrase with the union in place of `Together`, except if a whole question asks for both."""
     parts = parts_of(phrase)
     keeps = together and isinstance(phrase, Together)
     changed: dict[str, Any] = {name: loosened(part, keeps) for name, part in parts.items()}

@@ -1,4 +1,4 @@
-"""Whether the scene holds what a phrase names: a "not in this scene" that needs no fit to an encoder.
+"""Presence: whether the scene holds the thing that a phrase names, without calibration to an encoder.
 
 Every phrase has a best place in every scene, even if the object is absent. Presence is decided by how well the phrase
 describes that place, on the scale of everyday words (`lexsplat.queries.everyday`):

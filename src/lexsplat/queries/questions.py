@@ -1,4 +1,4 @@
-"""Questions and requests as phrases: the words around the thing are taken off."""
+"""Questions and requests as phrases: removes the words around the thing."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def without_hidden(chosen: Selection, hidden: Tensor) -> Selection:
 
 @torch.no_grad()
 def whole_things(chosen: Selection, hidden: Tensor, segments: Segments | None) -> Selection:
-    """A selection with what belongs to its things besides: their borders, and the hidden Gaussians in them.
+    """A selection extended by the borders of its things and the hidden Gaussians in them.
 
     A segment belongs to it if half of what the views show of the segment is selected, and a hidden Gaussian if two of
     its six nearest neighbors that can be seen are.

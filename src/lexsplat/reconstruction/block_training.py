@@ -231,7 +231,7 @@ def adam_steps(config: ReconstructionConfig, name: str, step: int) -> int:
 def reconstruct_blocks(
     capture: Capture, config: ReconstructionConfig, points: InitialPoints, up: Up, count: int, run: BlockRun
 ) -> Gaussians:
-    """Reconstruct a capture block by block; a run that was killed goes on after the last finished visits.
+    """Reconstruct a capture block by block; a killed run resumes after the last finished visits.
 
     Args:
         capture: Views and split.
@@ -316,7 +316,7 @@ def _write_start(
 def _room(
     files: CellFiles, number: int, groups: int, config: ReconstructionConfig, cap: int
 ) -> tuple[int, ...]:
-    """How many Gaussians round ``number`` of density control may add to each cell.
+    """Number of Gaussians that round ``number`` of density control may add to each cell.
 
     Within the cap of the whole, those with the largest gradients grow. The numbers are kept in a file, because a run
     that was killed in a round goes on with those of its start.

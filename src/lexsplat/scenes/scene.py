@@ -326,7 +326,7 @@ class Scene:
         return Selection(self.gaussians, self.cameras, mask, scores, **facts)
 
     def click(self, view: str | StoredView | Camera, x: float, y: float) -> Selection:
-        """The surface at a pixel, and what is connected to it and means the same.
+        """The surface at a pixel, and connected Gaussians with the same language.
 
         Args:
             view: The view that was clicked.

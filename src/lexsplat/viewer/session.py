@@ -286,7 +286,7 @@ class Session:
     def _change(self, action: str, chosen: Selection, values: Mapping[str, Any]) -> None:
         left = {"delete": len(chosen.mask) - len(chosen), "keep": len(chosen)}.get(action, len(chosen.mask))
         if left < 2:
-            raise QueryError(action, expected="at least 2 Gaussians afterwards", found=str(left))
+            raise QueryError(action, expected="at least 2 Gaussians after the edit", found=str(left))
         if action == "recolor":
             self.editor.recolor(chosen, vector(values, "color"), number(values, "strength", 1.0))
         elif action in ("move", "duplicate"):

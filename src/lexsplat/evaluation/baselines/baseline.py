@@ -50,4 +50,4 @@ class Baseline(Protocol):
         """Whether the prompts of the evaluation are known to it in advance, as classes."""
 
     def fit(self, data: TrainingData, run: BaselineRun) -> Method:
-        """Make what answers prompts."""
+        """Make the object that answers prompts."""

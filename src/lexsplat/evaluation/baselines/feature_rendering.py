@@ -105,7 +105,7 @@ class GaussianFeatures:
         self.method, self.features, self.scales = method, features, scales
 
     def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
-        """Maps ``[P, H, W]``: LERF's relevancy of the rendered feature, times how much is covered."""
+        """Maps ``[P, H, W]``: LERF's relevancy of the rendered feature times the coverage."""
         positives, negatives = unit_texts(question.positives, question.negatives)
         texts, split = torch.cat([positives, negatives]), len(positives)
         maps = []

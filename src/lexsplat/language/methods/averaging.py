@@ -173,7 +173,7 @@ def _is_seen(workers: Workers, folder: Path | None) -> bool:
 
 
 def sums_bound(device: torch.device, memory: int) -> int:
-    """Bytes that the sums may take: half of what is free on their GPU; on a CPU a quarter of the host memory.
+    """Bytes that the sums may take: half of the free memory of their GPU; on a CPU a quarter of the host memory.
 
     Sums of workers travel through the host, so that its bound holds for them too.
 
@@ -224,7 +224,7 @@ class _Averaging:
 
 
 def view_shards(names: Sequence[str]) -> list[tuple[str, ...]]:
-    """The views in shards whose sums are made apart and then added in order.
+    """The views in shards, whose sums are computed separately and then added in order.
 
     The shards depend on the views alone, not on the workers, and so do the bits of the sums.
     """
@@ -279,7 +279,7 @@ def _cell_weights(
 
 
 def _any_nonzero(values: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which rows ``[..., C]`` have a number but 0, by their bits without the sign: NumPy is slow at halves."""
+    """Which rows ``[..., C]`` have a nonzero number, by their bits without the sign: NumPy is slow at halves."""
     bits = values.view(f"u{values.itemsize}")
     return np.asarray(np.bitwise_or.reduce(bits, axis=-1) << 1 != 0)
 

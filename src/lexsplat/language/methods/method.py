@@ -1,4 +1,4 @@
-"""The interface of a method: what it needs, what it can leave out, and how it makes a language field."""
+"""The interface of a method: its inputs, its ablations, and how it makes a language field."""
 
 from __future__ import annotations
 

@@ -191,7 +191,7 @@ def _before_photo(
 
 
 def _warn(tried: _Tried, found: Surroundings, gaussians: Gaussians, subject: Path) -> None:
-    """Warn of a kind that is uncertain, or that depends on an up direction that is a guess."""
+    """Warn if room or object is uncertain, or depends on an up direction that is a guess."""
     interior = tried.interior
     taken = (
         ("a room and looked at from inside", "around")

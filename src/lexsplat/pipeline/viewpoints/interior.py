@@ -1,4 +1,4 @@
-"""Whether splats are a room, to be looked at from inside, or an object, to be looked at from around.
+"""Whether splats are a room, viewed from inside, or an object, viewed from around.
 
 A room is closed all around its free places, and holds things. A ball or crate from a mesh converter is also closed,
 but empty: from any place inside, only the convex shell around that place is seen.

@@ -1,4 +1,4 @@
-"""``library.json``: what makes a folder a library, with its own name on an index server."""
+"""``library.json``, which marks a folder as a library and holds its name on an index server."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def make_library(root: Path) -> None:
 
 
 def in_use(root: Path, holder: str) -> LibraryError:
-    """The error where another process changes a library."""
+    """The error if another process changes a library."""
     return LibraryError(
         root,
         expected="a library that no other process changes",

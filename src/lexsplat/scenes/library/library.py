@@ -252,7 +252,7 @@ class Library:
                 clip,
                 expected=f"the encoder of the scenes ({content_hash[:12]})",
                 found="another one",
-                remedy="put the right one there, or build the scenes again and add them again",
+                remedy="put the right encoder there, or rebuild the scenes and add them again",
             ) from error
 
     def _tower(self, clip: str) -> TextTower:

@@ -40,7 +40,7 @@ def problems_of(library: Library) -> dict[str, str]:
 
 
 def mended(library: Library) -> dict[str, str]:
-    """Repair what can be repaired; returns what is still wrong, as `problems_of`.
+    """Repair what can be repaired; returns the remaining problems, as `problems_of`.
 
     Raises:
         LibraryError: If another process changes the library, the disk is full, or the server fails.
@@ -53,7 +53,7 @@ def mended(library: Library) -> dict[str, str]:
 
 
 def orphans(library: Library) -> dict[str, str]:
-    """Scenes whose codes are there without a record, and what to do."""
+    """Scenes with codes and without a record, each with a remedy."""
     found = {}
     for name in sorted(scenes_without_record(library.stage)):
         problem = f"{library.stage / name}.json: expected the record of a scene, found files without one"

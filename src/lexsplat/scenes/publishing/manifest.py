@@ -21,7 +21,7 @@ from lexsplat.scenes.scene import Scene
 
 FORMAT, FORMAT_VERSION = "lexsplat-page", 7
 DRAWN_SPLATS = 1_000_000
-"""Gaussians that a page draws at once, at most; of more, those that cover most of the image."""
+"""Maximum number of Gaussians that a page draws at once; it chooses those that cover most of the image."""
 MOST_OBJECTS = 200
 """Entries of the list of objects, at most."""
 
