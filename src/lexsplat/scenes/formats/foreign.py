@@ -145,7 +145,10 @@ def _turned(quats: Tensor, path: Path) -> Tensor:
     empty = (quats.abs() < _SMALLEST_QUAT).all(1)
     if count := int(empty.sum()):
         warn(
-            "%s: %d of %d Gaussians have a rotation of four zeros, read as no rotation", path, count, len(quats)
+            "%s: %d of %d Gaussians have a rotation of four zeros, read as no rotation",
+            path,
+            count,
+            len(quats),
         )
     return torch.where(empty[:, None], quats.new_tensor([1.0, 0, 0, 0]), quats)
 
