@@ -261,6 +261,7 @@ def test_the_overview_lists_every_command(capsys):
     for name, entry in cli.COMMANDS.items():
         assert f"  {name} " in page
         assert entry.summary in page
+    assert "lexsplat COMMAND --help-all   all options\n" in page
 
 
 def test_the_help_page_that_an_error_names_is_that_of_the_command(capsys):

@@ -100,7 +100,7 @@ def test_a_library_that_is_gone_is_an_error_with_its_place_and_a_remedy(server, 
         error = reply.structured_content["error"]
         assert error["subject"] == str(library.root)
         assert "moved or deleted" in error["found"]
-        assert "put it back" in error["remedy"]
+        assert "restore the folder" in error["remedy"]
         assert str(library.root) in text
     with pytest.RaisesGroup(pytest.RaisesExc(MCPError, match="moved or deleted"), flatten_subgroups=True):
         talk(server, lambda client: client.read_resource("lexsplat://scenes"))

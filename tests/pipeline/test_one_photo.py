@@ -76,5 +76,5 @@ def test_few_views_that_hide_most_of_what_can_be_seen_are_refused(monkeypatch, s
     if not refused:
         assert choose_views(gaussians, up=UP).unseen == pytest.approx(0.5 * len(gaussians), rel=0.01)
         return
-    with pytest.raises(CaptureError, match="90% of it is hidden by floaters or haze; remove"):
+    with pytest.raises(CaptureError, match="floaters or haze hide 90% of these Gaussians; remove"):
         choose_views(gaussians, up=UP)

@@ -128,7 +128,7 @@ def test_a_scene_being_rebuilt_is_neither_evaluated_nor_edited(built_copy, capsy
     for command in (["evaluate"], ["edit"]):
         arguments = [str(built_copy), *(["delete", "--select", "red ball"] if command == ["edit"] else [])]
         assert cli.main([*command, *arguments]) == 1
-        assert "one at work, or stopped half way" in capsys.readouterr().err
+        assert "a build that is running or was interrupted" in capsys.readouterr().err
     assert cli.main(["query", str(built_copy), "red ball", "--json"]) == 0
 
 

@@ -78,8 +78,8 @@ def test_an_invalid_parameter_restores_the_last_good_state_halves_the_rates_and_
     lines = [record.getMessage() for record in caplog.records]
     assert len(lines) == 2
     assert all("walk diverged (NaN or Inf in value)" in line and "\n" not in line for line in lines)
-    assert "learning rates now 0.5 " in lines[0]
-    assert "learning rates now 0.25 " in lines[1]
+    assert "learning rates are now 0.5 " in lines[0]
+    assert "learning rates are now 0.25 " in lines[1]
 
 
 def test_the_result_is_always_checked(monkeypatch):

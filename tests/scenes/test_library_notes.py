@@ -106,7 +106,7 @@ def test_a_library_that_is_gone_while_it_is_open_is_reported_until_it_is_back(tw
             question()
         assert str(copy / gone) in str(error.value)
         assert "moved or deleted" in error.value.found
-        assert "put it back" in error.value.remedy
+        assert "restore the folder" in error.value.remedy
     assert not (copy / gone).exists()
     assert repr(library).endswith("gone)")
     (copy / "elsewhere").rename(copy / gone)

@@ -341,7 +341,7 @@ def test_rotations_of_four_zeros_are_a_warning_that_says_what_becomes_of_them(tm
     g.quats[:10] = 0
     write_ply(g, tmp_path / "g.ply")
     found = read_splats(tmp_path / "g.ply")
-    assert "g.ply: 10 of 30 Gaussians have a rotation of four zeros, read as unturned" in caplog.text
+    assert "g.ply: 10 of 30 Gaussians have a rotation of four zeros, read as no rotation" in caplog.text
     assert found.quats[:10].tolist() == [[1, 0, 0, 0]] * 10
     assert torch.equal(found.quats[10:], g.quats[10:])
 

@@ -250,7 +250,7 @@ def test_a_scene_is_never_edited_to_nothing(session, scene_and_balls, monkeypatc
     everything = scene_and_balls[0].select("ball 1")
     everything = everything | ~everything
     monkeypatch.setattr(session, "_chosen", lambda _: everything)
-    with pytest.raises(QueryError, match="at least 2 Gaussians afterwards"):
+    with pytest.raises(QueryError, match="at least 2 Gaussians after the edit"):
         session.edit("delete", Asked("ball 1"), {})
 
 

@@ -15,7 +15,7 @@ LACKS, LACKS_PART = 0.15, 0.04
 """It is false if what it names, or may name, has less than this; between the two it is open."""
 HALF, EIGHTH = 0.5, 0.125
 """The same two of a patch, of which everything weighs the same."""
-CENTRE = 0.1
+CENTER = 0.1
 """With this share of the weight a part is shown if it also lies in the very middle."""
 BESIDE = 0.15
 """With less than this share of the weight a part that is not in the very middle is only beside what is shown."""
@@ -26,7 +26,7 @@ class TruthTable:
 
     Args:
         labels: All labels that occur.
-        center: Whether a part is also true of a crop whose middle it is, with ``CENTRE`` of the weight. A handle
+        center: Whether a part is also true of a crop whose middle it is, with ``CENTER`` of the weight. A handle
             is thin: in a crop that also shows what it belongs to, it never has a quarter of the weight.
         beside: A part with less of the weight, and not in the middle, is false of a crop instead of open. Where
             it is open, what lies around a part answers like the part itself, and the best place is any of these.
@@ -74,9 +74,9 @@ class TruthTable:
         if self.center:
             middle = np.array([crop.grid[GRID // 2, GRID // 2] for crop in crops])
             answers = np.stack([self._columns(phrase)[0] for phrase in phrases], 1)
-            centerd = is_part & answers[middle] & (middle >= 0)[:, None]
-            shows = np.where(centerd, CENTRE, shows)
-            lacks = np.where(is_part & ~centerd, self.beside, lacks)
+            centered = is_part & answers[middle] & (middle >= 0)[:, None]
+            shows = np.where(centered, CENTER, shows)
+            lacks = np.where(is_part & ~centered, self.beside, lacks)
         return np.where(true >= shows, TRUE, np.where(possible < lacks, FALSE, OPEN)).astype(np.int8)
 
     def at_places(self, phrases: Sequence[Phrase], patches: Sequence[Crop]) -> NDArray[np.int8]:

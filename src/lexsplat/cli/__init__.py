@@ -157,8 +157,9 @@ def overview() -> str:
             "",
             *commands,
             "",
-            "lexsplat COMMAND --help   the options that people use",
-            "lexsplat --version        the version",
+            "lexsplat COMMAND --help       the options that people use",
+            "lexsplat COMMAND --help-all   all options",
+            "lexsplat --version            the version",
         )
     )
 

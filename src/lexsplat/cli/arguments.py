@@ -1,11 +1,11 @@
 """From the words of a command line to a command: tyro with short help pages and plain placeholders.
 
-A command class may have these attributes beside its fields:
+A command class may have these attributes in addition to its fields:
 
 - ``essential``: names of the settings of a build that ``--help`` shows; ``--help-all`` shows the others, too;
 - ``rare``: names of the command's own options that only ``--help-all`` shows;
 - ``unused``: names of the settings that the command accepts and ignores, which no help page shows;
-- ``defaults``: defaults of options that are None or empty, in words, beside the usual ones;
+- ``defaults``: defaults of options that are None or empty, in words, in addition to the usual ones;
 - ``synonyms``: other spellings of options;
 - ``elsewhere``: options of another command, with the command that has them.
 
@@ -172,7 +172,7 @@ def _print_help(command: type, program: str, hidden: set[str]) -> None:
 
 
 def _description(command: type) -> str:
-    """What a docstring states before its arguments, wrapped; indented blocks stay as they are."""
+    """The text of a docstring before its arguments, wrapped; indented blocks stay as they are."""
     width = min(shutil.get_terminal_size().columns, 80)
     blocks = (inspect.getdoc(command) or "").split("\nArgs:")[0].strip().split("\n\n")
     return "\n\n".join(block if block.startswith(" ") else textwrap.fill(block, width) for block in blocks)

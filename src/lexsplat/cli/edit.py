@@ -196,5 +196,5 @@ class Edit:
                     editor.keep(chosen)
         except ValueError as error:  # numbers that are only invalid together or for these Gaussians
             raise QueryError(
-                self.action, expected="Gaussians that can be drawn afterwards", found=str(error)
+                self.action, expected="Gaussians that can be drawn after the edit", found=str(error)
             ) from error

@@ -1,4 +1,4 @@
-"""What ``ablate`` and ``compare`` share: opening the bench, and printing the table."""
+"""Code shared by ``ablate`` and ``compare``: opening the bench, and printing the table."""
 
 from __future__ import annotations
 

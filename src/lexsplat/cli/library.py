@@ -52,7 +52,7 @@ class LibraryCommand:
         words: Scene folders or the word "demo" for add, names or folders for remove, phrases for search.
         limit: Scenes of an answer, at most.
         thumbnails: Folder of the thumbnails that search writes; "none" writes none.
-        confirm: Search the scenes themselves, also where the index suffices.
+        confirm: Search the scenes themselves, even where the index suffices.
         repair: Repair what verify finds.
         index: Address of a Chroma server that proposes scenes, such as http://localhost:8000.
         device: "auto" takes CUDA where there is a GPU.

@@ -1,4 +1,4 @@
-"""What several commands share: placeholders, checks, opening a scene, asking on a terminal, printing.
+"""Code shared by several commands: placeholders, checks, opening a scene, asking on a terminal, printing.
 
 Nothing here loads torch, so that help pages and wrong usage are answered at once.
 """

@@ -33,7 +33,7 @@ class Poses:
         output: Folder for the COLMAP project.
         frames: Number of frames that are taken from a video.
         seed: Seed of all randomness.
-        memory: Memory budget, such as 4GB, beside what the libraries need. It determines how many photos are
+        memory: Memory budget, such as 4GB, in addition to what the libraries need. It determines how many photos are
             processed at once.
         settings: Settings of structure from motion.
     """

@@ -32,7 +32,7 @@ class Query:
         prompts: What to look for, such as "red apple" "something to sit on".
         view: Names of the views to answer in.
         output: Folder for the images.
-        images: A heatmap and a mask for each prompt and view; --no-images writes none.
+        images: Write a heatmap and a mask for each prompt and view; --no-images does not.
         features: Also write the language features of each view: features/VIEW.safetensors and their principal
             components as colors, features/VIEW.png.
         threshold: Relevancy from which a pixel belongs to the mask. The paper's is 0.5.

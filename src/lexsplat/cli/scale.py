@@ -92,7 +92,7 @@ class Scale:
         print(f"up: ({direction}) from the {world.source}{'' if world.up.reliable else ', uncertain'}")
 
     def _length(self, folder: str) -> float:
-        """The given distance as it is in the scene, in world units."""
+        """The given distance as measured in the scene, in world units."""
         from lexsplat.geometry.world import parse_vector
         from lexsplat.scenes.scale import height_of, length_between, positive_length
 

@@ -25,7 +25,7 @@ class View:
         scene: A scene folder, or the word "demo" for the bundled scene.
         host: Address to listen on. On others than 127.0.0.1, visitors need the token of the printed address.
         port: Port to listen on. The next free port is used if it is taken.
-        name: Host names under which the page may be opened, beside localhost and addresses.
+        name: Host names under which the page may be opened, in addition to localhost and addresses.
         splats: Maximum number of Gaussians that the browser draws.
         clip: Text encoder: a name on the Hugging Face Hub or a folder.
         device: "auto" takes CUDA where there is a GPU.

@@ -23,7 +23,7 @@ _PATIENCE = 2.0
 class LateProgress:
     """A listener that shows a stage if it is not finished after two seconds, and nothing before.
 
-    A timer shows it also where the stage sends no event meanwhile. Stages may contain stages.
+    A timer shows it even if the stage sends no event meanwhile. Stages may contain stages.
 
     Args:
         patience: Seconds without anything shown.

@@ -1,4 +1,4 @@
-"""How long a codebook and its index maps take, measured on a few views and steps before they are made."""
+"""Time estimate of a codebook and its index maps, measured on a few views and steps beforehand."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def tell_codebook(
     memory: int = budget.DEFAULT_MEMORY,
     listener: Listener = silent,
 ) -> None:
-    """Log how long the codebook will take (`forecast`); the listener receives events of stage "calibrate".
+    """Log the estimated time of the codebook (`forecast`); the listener receives events of stage "calibrate".
 
     Raises:
         MemoryBudgetError: If the sample does not fit into ``memory``, as in the fit.

@@ -9,7 +9,7 @@ MAX_CODES = 256
 """Most codes of a codebook: an index map has one byte a pixel."""
 
 PAPER_CODES = 128
-"""Codes of the paper, but for two of its scenes."""
+"""Number of codes in the paper, except for two of its scenes."""
 
 
 @dataclass(frozen=True)

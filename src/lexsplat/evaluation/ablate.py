@@ -162,7 +162,7 @@ def make_language(
 ) -> tuple[LanguageField, dict[str, float]]:
     """Make the language field of the settings; returns it with the seconds of its stages.
 
-    A method without codes of views receives wrong labels as the features of the wrong codes.
+    A method without index maps is fitted to the features of the wrong codes instead of wrong labels.
     """
     method, seconds = METHODS[config.method], {}
     views = TrainingViews({name: bench.capture.views[name] for name in bench.capture.train_names})

@@ -1,4 +1,4 @@
-"""A bench for several methods or variants on the same Gaussians and features: what ``ablate`` and ``compare`` share.
+"""A bench for several methods or variants on the same Gaussians and features, for ``ablate`` and ``compare``.
 
 Gaussians and features are made once (``OUTPUT/scene``, a scene folder that ``build`` can resume), codebooks once for
 each setting and seed. Every measured run is kept, so that an interrupted command resumes where it stopped.
@@ -70,7 +70,7 @@ class Row:
 
     Args:
         name: Name of the method or variant.
-        settings: Everything the language depends on beside seed and shared stages: dataclasses and plain data.
+        settings: Everything the language depends on except seed and shared stages: dataclasses and plain data.
         make: Makes the language of a seed.
         form: How codes and text are compared.
     """

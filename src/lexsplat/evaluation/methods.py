@@ -1,4 +1,4 @@
-"""What an evaluation measures: a `Scene`, or a rebuilt method on the same Gaussians (`MethodScene`)."""
+"""Subjects of an evaluation: a `Scene`, or a rebuilt method on the same Gaussians (`MethodScene`)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class MethodAnswers:
-    """What `MethodScene.ask` answers, as `lexsplat.scenes.answers.Answers` has it.
+    """Answers of `MethodScene.ask`, with the names that `lexsplat.scenes.answers.Answers` has.
 
     Args:
         scores: Relevancy of every Gaussian ``[P, N]``; None for a method without 3D.

@@ -129,7 +129,7 @@ class ClipEncoder(PretrainedModel):
         return found
 
     def text_only(self, device: torch.device | str) -> ClipText | ClipEncoder:
-        """What answers texts as `load_text` of this model does, without loading it again.
+        """The text tower of this model as `load_text` returns it, without loading the model again.
 
         Of other architectures than CLIP's own it is this encoder, which gives its image tower away.
         """
@@ -180,7 +180,7 @@ class ClipEncoder(PretrainedModel):
         return {key: tokens[key].to(self.device) for key in keys}
 
     def tokens_over(self, prompt: str) -> int:
-        """How many tokens of a prompt are more than the model reads, and so cut."""
+        """Number of tokens by which a prompt exceeds the limit of the model and is truncated."""
         if len(prompt) + 2 <= self._text_length:  # a token but start and end has at least one character
             return 0
         return max(len(self._tokenizer(prompt, verbose=False)["input_ids"]) - self._text_length, 0)

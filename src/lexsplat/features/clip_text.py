@@ -34,7 +34,7 @@ _LEGACY_END = 2
 """An end token of this number stands for the largest number in the prompt, as in OpenAI's code."""
 _MOST_LAYERS = 1000
 UNLIKE = 1e-5
-"""Distance of two unit vectors that are equal but for rounding."""
+"""Largest distance of two unit vectors that are equal up to rounding."""
 UNLIKE_WORDS = ("an apple", "a wooden table", "blue sky", "a car")
 """Words to which every encoder gives different embeddings."""
 
@@ -192,7 +192,7 @@ class ClipText:
         return F.normalize(x[0, int(end.argmax())] @ weights["text_projection.weight"].T, dim=-1).cpu()
 
     def tokens_over(self, prompt: str) -> int:
-        """How many tokens of a prompt are more than the model has positions, and so cut."""
+        """Number of tokens by which a prompt exceeds the positions of the model and is truncated."""
         return max(len(self._tokenizer.encode(prompt).ids) - self._limit, 0)
 
     def _tokens(self, prompt: str) -> Tensor:

@@ -1,4 +1,4 @@
-"""How long the encoders take for one photo, measured before a long build."""
+"""Time estimate of the encoders for one photo, measured before a long build."""
 
 from __future__ import annotations
 
@@ -71,6 +71,7 @@ def _crop_seconds(clip: ImageTextEncoder, config: FeatureConfig, capture_size: t
     encode = clip.encode_images if config.tokens == "class" else lambda crops: clip.encode_patches(crops)[0]
 
     def measure(count: int) -> float:
+        # Not `evenly`: few boxes are repeated, so that always ``count`` crops are timed.
         chosen = boxes[np.linspace(0, len(boxes) - 1, count).round().astype(int)]
         start = time.perf_counter()
         list(encode_stream(encode, [((), cut_crops(image, chosen, clip.image_size, batch))], batch))

@@ -83,7 +83,7 @@ def load_external_features(
 
 
 def check_external_features(folder: Path, capture: Capture) -> None:
-    """Refuse what the headers of .npy files tell, before anything that takes time; values are checked on access.
+    """Refuse arrays whose .npy headers are wrong, before anything that takes time; values are checked on access.
 
     Args:
         folder: Folder of the arrays (`load_external_features`).

@@ -291,7 +291,7 @@ class _Extraction:
                     else:
                         yield finished
             finally:
-                self._stop.set()  # also when the consumer stops early or is interrupted
+                self._stop.set()  # even if the consumer stops early or is interrupted
         for future in futures:
             future.result()
 

@@ -1,4 +1,4 @@
-"""Finds the folder of a model: in the package, a given folder, the hub's cache, or on the hub.
+"""Finds the folder of a model: in the package, a given folder, the Hub's cache, or on the Hub.
 
 Encoders are built from a local folder, so their code is the same with and without internet.
 """
@@ -117,7 +117,7 @@ def local_folder(name: str, tower: str) -> Path | None:
 
 
 def missing_part(folder: Path, tower: str) -> str:
-    """What a folder lacks to be a model, in words; "" if nothing."""
+    """Name of a file that a model folder lacks; "" if it is complete."""
     if not (folder / "config.json").is_file():
         return "config.json"
     if not weight_files(folder):
@@ -352,7 +352,7 @@ def _option(tower: str) -> str:
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An error and what it was raised from."""
+    """An error and the errors that it was raised from."""
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__

@@ -118,7 +118,7 @@ def bfloat16_is_faster() -> bool:
         return False
     tokens, layer = torch.ones(4 * 197, 768), torch.nn.Linear(768, 3072).requires_grad_(False)
     fastest = {False: math.inf, True: math.inf}
-    with one_thread():  # several would wait for each other beside other programs
+    with one_thread():  # several would wait for each other while other programs run
         for half in (False, True) * 3:
             start = time.thread_time()
             with torch.autocast("cpu", dtype=torch.bfloat16, enabled=half):

@@ -32,12 +32,12 @@ if TYPE_CHECKING:
     from lexsplat.captures import Capture, View
 
 SOURCES = ("none", "slic", "sam2")
-"""Words for where segments come from, beside folders and models."""
+"""Names of sources of segments other than folders and models."""
 
 SUPERPIXELS = (3000, 1000)
 """Superpixels of a photo in each level of "slic"."""
 
-_COMPACTNESS = 10.0  # of superpixels: weight of distance beside that of color
+_COMPACTNESS = 10.0  # of superpixels: weight of distance relative to color
 _SHORT_SIDE = 480  # pixels of the photo in which superpixels are searched: about four a cell
 
 
@@ -84,7 +84,7 @@ def sam2_name(name: str) -> str | None:
 
 
 def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
-    """What finds segments.
+    """Load the source of 2D segments.
 
     Args:
         name: "slic", "sam2", a folder of segments, or the name or folder of a SAM 2 model.
@@ -190,7 +190,7 @@ def _png_numbers(path: Path) -> NDArray[np.int32]:
 
 
 def check_segments(config: FeatureConfig, capture: Capture) -> None:
-    """Refuse what can be known about segments before anything that takes time; models are checked when loaded.
+    """Refuse unusable segments before anything that takes time; models are checked when loaded.
 
     Args:
         config: Settings of the features.
@@ -226,7 +226,7 @@ def segments_identity(name: str, capture: Capture) -> list[str]:
     return ["folder", *(f"{view.stem} {file_hash(folder.path(view), 16)}" for view in capture.train_views)]
 
 
-# Parameters beside the maps: the source of the segments, their cache, and the listener.
+# More than the maps: the source of the segments, their cache, and the listener.
 def pooled_features(
     maps: FeatureMaps,
     capture: Capture,

@@ -1,4 +1,4 @@
-"""Texts to embeddings: the lightest tower that gives them, and a cache on disk: known words need no encoder."""
+"""Text embeddings: from the lightest tower that has them, and from a cache on disk for known words."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MAX_LENGTH = 1_000
 
 
 class TextTower(Protocol):
-    """What questions need of an encoder."""
+    """Text side of an encoder, which is all that queries need."""
 
     content_hash: str
 
@@ -56,7 +56,7 @@ def load_text(name: str, device: torch.device | str = "cpu") -> TextTower:
 
 
 def check_encoder(name: str, content_hash: str, needed: str | None) -> None:
-    """Refuse an encoder whose hash is not the one of the features; None as ``needed`` knows of none.
+    """Refuse an encoder whose hash is not that of the features; ``needed`` is None if that is unknown.
 
     Raises:
         ModelError: It is another one.

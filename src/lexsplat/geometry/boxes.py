@@ -199,7 +199,7 @@ def _smallest_footprint(points: NDArray, up: NDArray, trims: tuple[float, ...]) 
 def _trimmed_ends(
     values: NDArray, trims: tuple[float, ...]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The lowest and highest of every column of ``[M, C]`` but for a share at each end, for each share ``[T, C]``."""
+    """Minimum and maximum ``[T, C]`` of each column of ``[M, C]`` after trimming each of T shares at both ends."""
     count = len(values)
     low = [max(math.ceil(trim * count) - 1, 0) for trim in trims]
     high = [count - 1 - math.floor(trim * count) for trim in trims]

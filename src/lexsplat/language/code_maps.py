@@ -1,4 +1,4 @@
-"""Index maps as training reads them: a code for every pixel of a view, also if the map is coarser than the view.
+"""Index maps as training reads them: a code for every pixel of a view, even if the map is coarser than the view.
 
 Cell j of w covers the pixels whose centers lie in [j W / w, (j + 1) W / w).
 """

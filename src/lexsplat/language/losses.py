@@ -27,13 +27,13 @@ def mean_in_blocks(
 ) -> Tensor:
     """A mean over rows with its gradients, which holds the activations of one block of rows at a time.
 
-    Value and gradients are those of ``loss(*rows)``, but for the order of sums. Full maps take two thirds of the time
+    Value and gradients are those of ``loss(*rows)``, up to the order of sums. Full maps take two thirds of the time
     on a CPU, and memory for one block. Few rows are one block.
 
     Args:
         loss: The mean of a loss over rows of the tensors.
         rows: Tensors ``[M, ...]``.
-        parameters: Tensors that the loss reads beside its arguments, for their gradients.
+        parameters: Tensors that the loss reads in addition to its arguments, for their gradients.
     """
     count = len(rows[0])
     block = CPU_BLOCK if rows[0].device.type == "cpu" else GPU_BLOCK

@@ -1,4 +1,4 @@
-"""What each segment of a field means: its mean distribution over the codes.
+"""Language of each segment of a field: its mean distribution over the codes.
 
 Dimension letters: N Gaussians, K codes, L levels, S lowest segments, V segments of all levels, each once.
 """

@@ -1,4 +1,4 @@
-"""Felzenszwalb and Huttenlocher's segments of a graph, compiled; apart, because most commands need no Numba."""
+"""Felzenszwalb and Huttenlocher's segments of a graph, compiled; in its own file because Numba is rarely needed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A hierarchy of segments in 3D: parts, objects and groups, made from what a build has, without classes or training.
+"""A hierarchy of segments in 3D: parts, objects and groups, from the results of a build, without classes or training.
 
 1. Each Gaussian is linked to its nearest neighbors. A link is short where language and color agree.
 2. Felzenszwalb and Huttenlocher 2004 join linked Gaussians to small segments of at least `_SMALLEST` Gaussians: two

@@ -1,4 +1,4 @@
-"""What the tools answer, as types: `lexsplat.mcp.server` makes the output schemas of them.
+"""Types of the tools' answers, from which `lexsplat.mcp.server` makes the output schemas.
 
 The documents are those of the commands (docs/schemas); the tests compare both.
 """
@@ -80,7 +80,7 @@ class Asked(Certainty):
 
 
 class Counted(World, Asked):
-    """How many."""
+    """The number of things."""
 
     phrase: str
     count: Count
@@ -114,7 +114,7 @@ class RelateAnswer(World, Answer):
 
 
 class Name(TypedDict):
-    """What an object may be called."""
+    """A candidate name of an object."""
 
     name: str
     probability: float
@@ -229,7 +229,7 @@ class Heat(Asked):
 
 
 class RenderAnswer(World):
-    """What the image shows."""
+    """Content of the rendered image."""
 
     view: str
     look_at: Annotated[Asked | None, Field(description="null where the view was given.")]
@@ -255,7 +255,7 @@ class Hit(World):
 
 
 class Problem(TypedDict):
-    """What is wrong with a scene of a library."""
+    """A problem of a scene in a library."""
 
     scene: str
     problem: str

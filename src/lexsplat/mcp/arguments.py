@@ -1,4 +1,4 @@
-"""What is wrong with the arguments of a call: which one, what was expected, what was found, and what to do."""
+"""Errors in the arguments of a call: the argument, the expected value, the value found, and a remedy."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _wrong(key: str, schema: Schema, value: Any, places: Iterable[int] = ()) -> 
 
 
 def _kind(schema: Schema) -> str:
-    """What a schema admits, for people."""
+    """The values that a schema admits, in words."""
     if "enum" in schema:
         return f"one of {', '.join(schema['enum'])}"
     if "anyOf" in schema:

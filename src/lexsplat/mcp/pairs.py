@@ -72,7 +72,7 @@ def others(things: Sequence[Selection], than: Sequence[Selection]) -> list[Selec
 
 
 def called(one: Selection, among: Sequence[Selection]) -> str:
-    """What to call a thing: its name, with its place if another has the same name."""
+    """Name of a thing, with its place if another thing has the same name."""
     if sum(each.phrase == one.phrase for each in among) < 2:
         return one.phrase
     return f"{one.phrase} at ({', '.join(f'{value:.2f}' for value in one.center)})"

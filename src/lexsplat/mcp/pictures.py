@@ -23,7 +23,7 @@ _LINE = 18
 
 
 def picture(scene: Scene, view: str, phrases: Sequence[str]) -> tuple[list[dict[str, Any]], bytes]:
-    """A view in color, or one heatmap a phrase side by side, as PNG, and what the heat shows.
+    """A view in color, or one heatmap a phrase side by side, as PNG, and facts about the heatmaps.
 
     Args:
         scene: The scene.

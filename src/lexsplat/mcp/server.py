@@ -75,7 +75,7 @@ class _Server(MCPServer):
     """A server that refuses every wrong call with one line and the keys of our other errors."""
 
     async def run_stdio_async(self) -> None:
-        server = self._lowlevel_server  # as in the base class, but for `messages`
+        server = self._lowlevel_server  # as in the base class, except for `messages`
         async with stdio_server() as (received, sent):
             lines: Any = messages(received, sent)
             await server.run(lines, sent, server.create_initialization_options())

@@ -1,6 +1,6 @@
-"""What a language model may ask of scenes. Each function returns one sentence and the same JSON as the commands.
+"""Tools for language models. Each function returns one sentence and the same JSON as the commands.
 
-The docstrings and type hints are what the model reads: `lexsplat.mcp.server` makes descriptions and schemas of them.
+The model reads the docstrings and type hints: `lexsplat.mcp.server` makes descriptions and schemas of them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _LISTED = 100
 
 
 class Reply(NamedTuple):
-    """What a tool answers: a sentence, plain data, and for `Tools.render` a PNG."""
+    """Answer of a tool: a sentence, plain data, and for `Tools.render` a PNG."""
 
     sentence: str
     document: dict[str, Any]
@@ -355,7 +355,7 @@ class LibraryTools(Tools):
 
 
 def _one_of(arguments: dict[str, Any]) -> None:
-    """Refuse two arguments of which each takes the place of the other, and none of them."""
+    """Refuse both or neither of two alternative arguments."""
     given = [name for name, value in arguments.items() if value]
     if len(given) != 1:
         first, second = arguments
@@ -394,7 +394,7 @@ def _found(scene: Scene, phrase: str) -> tuple[list[Selection], dict[str, Any]]:
 
 
 def asked_of(scene: Scene, phrase: str) -> tuple[Selection, dict[str, Any]]:
-    """What the scene holds of a phrase, and how it was understood (`answers.Asked`).
+    """The selection of a phrase, and how the phrase was understood (`answers.Asked`).
 
     Raises:
         QueryError: If the scene does not hold it.

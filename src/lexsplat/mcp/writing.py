@@ -144,7 +144,7 @@ def check_output(output: Path) -> None:
 
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Make the folder of a new file; what the disk refuses there is an error with a remedy."""
+    """Make the folder of a new file; errors of the disk in the block get a remedy."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield

@@ -317,7 +317,7 @@ class _Builder:
         )
 
     def _feature_maps(self) -> FeatureMaps:
-        """Features of the training views. What encodes photos is freed when all features are stored."""
+        """Features of the training views. The image encoders are freed when all features are stored."""
         if self._maps is None:
             config = self.config
             encoders = self.encoders = self.encoders or Encoders.of(config)

@@ -56,7 +56,7 @@ class BuildConfig:
             used for prompts only.
         memory: Host memory for photos, features and projections, such as "4GB". Libraries, encoders and Gaussians
             come on top (docs/conventions.md).
-        workers: Where views and scenes are worked on: "none" is this process, "ray" the cluster of RAY_ADDRESS or the
+        workers: Where views and scenes are processed: "none" is this process, "ray" the cluster of RAY_ADDRESS or the
             cores of this machine, "ray://HOST:PORT" a cluster (docs/scaling.md).
         blocks: Number of blocks in which the Gaussians and the photos are loaded one after the other, "auto" for as
             few as fit into the memory, or "none".
@@ -183,7 +183,7 @@ class BuildConfig:
         return (JOINT_METHODS if self.joint else METHODS)[self.method]
 
     def refuse_beside_splats(self) -> None:
-        """Refuse settings that make Gaussians of their own where Gaussians are given.
+        """Refuse settings of the reconstruction if Gaussians are given.
 
         Raises:
             ValueError: If they do.
@@ -210,7 +210,7 @@ class BuildConfig:
         )
 
     def resolved(self, device: str, capture_size: tuple[int, int]) -> BuildConfig:
-        """The same settings with every open one chosen.
+        """The same settings with every open choice made.
 
         What depends on the architecture of CLIP is chosen by its configuration, so the model has to be on this
         machine (`lexsplat.features.hub.model_folder`).

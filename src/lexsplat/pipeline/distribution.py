@@ -22,12 +22,12 @@ from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.workers import Needs, Outcome, SharedFolder, Workers, raise_failures
 
 LIBRARIES_BYTES = 1536 << 20
-"""Host memory of a worker beside its budget: the interpreter, the libraries and an encoder of usual size."""
+"""Host memory of a worker in addition to its budget: the interpreter, the libraries and an encoder of usual size."""
 
 
 @dataclass(frozen=True)
 class _Extraction:
-    """What the tasks of all views read: the capture without its points, settings, and where features are stored."""
+    """Inputs of all extraction tasks: the capture without its points, settings, and the store of features."""
 
     capture: Capture
     config: BuildConfig
@@ -102,7 +102,7 @@ def _encoders(clip: str, dino: str, device: str) -> Encoders:
 
 
 def _views_only(capture: Capture) -> Capture:
-    """A capture without views and points: what workers need of it beside the view of their task."""
+    """The capture without views and points. Workers need no more, since the view comes with the task."""
     none = capture.points[:0]
     return replace(capture, views={}, train_names=(), test_names=(), points=none, point_colors=none)
 
@@ -126,7 +126,7 @@ class SceneTask:
 
 @dataclass(frozen=True)
 class _Scenes:
-    """What all scenes share: the output folder, and in this process the listener of progress events."""
+    """Inputs shared by all scenes: the output folder, and in this process the listener of progress events."""
 
     folder: SharedFolder
     listener: Listener | None

@@ -37,7 +37,7 @@ BUNDLED_SCENES = Path(__file__).resolve().parents[1] / "demo"
 
 
 class Encoders:
-    """CLIP, DINO and what finds 2D segments, each loaded when it is first used and then kept.
+    """CLIP, DINO and the source of 2D segments, each loaded at first use and then kept.
 
     Args:
         clip: Name or folder of the image-text encoder.
@@ -73,7 +73,7 @@ class Encoders:
 
     @cached_property
     def segmenter(self) -> Segmenter | None:
-        """What finds 2D segments; None if features are not pooled by them."""
+        """The source of 2D segments; None if features are not pooled by segments."""
         return None if self._segments == "none" else load_segmenter(self._segments, self.device)
 
     def keep_text(self, device: str) -> None:
@@ -164,7 +164,7 @@ def check_encoders(
 
 
 def _tell_time(capture: Capture, config: BuildConfig, encoders: Encoders, cache_dir: Path) -> None:
-    """Log how long the features of the views that are not cached will take; nothing for a few seconds."""
+    """Log the estimated time of the features that are not cached, unless it is a few seconds."""
     clip, dino, settings = encoders.clip, encoders.dino, config.features
     missing = missing_views(capture, clip, dino, settings, cache_dir)
     if len(missing) < _TOLD_FROM:

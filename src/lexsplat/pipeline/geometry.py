@@ -1,4 +1,4 @@
-"""The ways to the Gaussians of a build, each an object: whole, in blocks, with language, or of another program.
+"""The ways to the Gaussians of a build, each an object: in one piece, in blocks, jointly with language, or given.
 
 They are the work of the stage "reconstruct". `way_to_geometry` chooses one by the settings.
 """
@@ -28,7 +28,7 @@ from lexsplat.scenes.folder import SceneFolder
 
 @dataclass(frozen=True)
 class GeometryRun:
-    """What a way reads beside the settings.
+    """Inputs of a `Geometry` in addition to the settings.
 
     Args:
         capture: The capture at the size to work at.
@@ -48,7 +48,7 @@ class GeometryRun:
 
     @property
     def checkpoints(self) -> Path:
-        """Where a way keeps what the next run resumes from."""
+        """Folder of the files from which the next run resumes."""
         return self.folder.root / "checkpoints"
 
     def initial_points(self) -> InitialPoints:
@@ -63,13 +63,13 @@ class Geometry:
     """A way to the Gaussians of a build: one reconstruction of the whole capture, where no other is asked for."""
 
     def inputs(self, config: BuildConfig, device: str) -> list[Any]:
-        """What its Gaussians depend on beside photos and cameras; the name of a stage stands for its inputs."""
+        """Inputs of the Gaussians other than photos and cameras. The name of a stage stands for its inputs."""
         fit = config.reconstruction
         rates = [fit.scale_of_rates] if fit.cooled_share else []  # a default that no setting holds
         return [fit, *rates, config.seed, device]
 
     def outputs(self, checkpoints: Path) -> list[Path]:
-        """What it writes beside the Gaussians."""
+        """Files that it writes in addition to the Gaussians."""
         return []
 
     def make(self, config: BuildConfig, run: GeometryRun) -> tuple[Gaussians, dict[str, Any]]:
@@ -138,7 +138,7 @@ class _WithLanguage(Geometry):
 
 @dataclass(frozen=True)
 class _Given(Geometry):
-    """The Gaussians of another program, if they show what the photos show."""
+    """The Gaussians of another program, if their renders agree with the photos."""
 
     path: Path
 
@@ -154,7 +154,7 @@ class _Given(Geometry):
 
 
 def way_to_geometry(config: BuildConfig, device: str, splats: Path | None) -> Geometry:
-    """The way that the settings ask for; given splats come before all others."""
+    """The way that the settings select; given splats take precedence."""
     if splats is not None:
         return _Given(splats)
     if config.joint:

@@ -94,7 +94,7 @@ def prepare_capture(
 
 
 def _frames_folder(output: Path) -> Path:
-    """Where the frames of a video are, in a scene folder."""
+    """Folder of the frames of a video, in a scene folder."""
     return output / "poses" / "images"
 
 
@@ -150,7 +150,7 @@ def preview_capture(
 def survey_photos(
     source: Path, output: Path, config: BuildConfig, test_names: list[str] | None
 ) -> PhotoSurvey | None:
-    """Look at photos without cameras, and at what was made of them elsewhere; None if there are cameras.
+    """Survey photos without cameras, and features and segments made of them elsewhere; None if there are cameras.
 
     That is ground truth, 2D segments, and features of another program.
 
@@ -258,7 +258,7 @@ def _registered_images(
 
 
 def _photos_fingerprint(source: Path, photos: Path, output: Path, config: BuildConfig) -> str:
-    """Fingerprint of the inputs of structure from motion: photos by name and size, masks also by time, settings."""
+    """Fingerprint of the inputs of structure from motion: photos (name, size), masks (also time), settings."""
     settings: list[Any] = [config.poses, config.seed]
     if is_video(source):
         if not source.is_file():

@@ -1,4 +1,4 @@
-"""Where a scene comes from: the record of its inputs, and fingerprints that detect changes."""
+"""Provenance of a scene: the record of its inputs, and fingerprints that detect changes."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def write_provenance(folder: SceneFolder, capture: Capture, config: BuildConfig)
 def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]) -> None:
     """Store the up direction, of the user, the cameras, or the splats from which views were chosen.
 
-    Chosen views are level with the up direction of the splats: what is estimated from them looks certain even where
-    that is a guess. A scale stored for other cameras is dropped.
+    Chosen views are level with the up direction assumed for the splats. An estimate from them would confirm that
+    direction even if it is a guess. A scale stored for other cameras is dropped.
     """
     record = folder.record
     world = world_of(record, cameras)
@@ -105,7 +105,7 @@ def _with_full_paths(features: FeatureConfig) -> FeatureConfig:
 
 
 def features_identity(config: BuildConfig, capture: Capture) -> list[Any]:
-    """What identifies the features of a build: settings and models, or the files of another program."""
+    """Identity of the features of a build: settings and models, or the files of another program."""
     clip = model_identity(config.clip, "clip")
     if config.features_from is not None:
         return [external_identity(config.features_from, capture), clip]
@@ -114,7 +114,7 @@ def features_identity(config: BuildConfig, capture: Capture) -> list[Any]:
 
 
 def settings_identity(features: FeatureConfig, capture: Capture) -> list[Any]:
-    """What identifies settings of features: without segments the same as before there were any."""
+    """Identity of the settings of features. Without segments it has no entry for them."""
     settings = to_json(features)
     name = settings.pop("segments")
     if name == "none":
@@ -125,7 +125,7 @@ def settings_identity(features: FeatureConfig, capture: Capture) -> list[Any]:
 
 
 def model_identity(name: str, kind: str) -> list[str]:
-    """What identifies a model: its name; for a folder also sizes and times of its files; a hash if it is bundled."""
+    """Identity of a model: its name; for a folder also sizes and times of its files; a hash if it is bundled."""
     if name == "bundled":  # its files differ between versions of lexsplat, and their times mean nothing
         return [name, content_hash(model_folder(name, kind), kind)]
     folder = Path(name).expanduser()

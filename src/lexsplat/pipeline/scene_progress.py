@@ -1,4 +1,4 @@
-"""Progress of several scenes: which scene an event or a warning is of, also where workers build the scenes."""
+"""Progress of several scenes: the scene of each event and warning, even where workers build the scenes."""
 
 from __future__ import annotations
 

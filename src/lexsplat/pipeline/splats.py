@@ -60,7 +60,7 @@ def splats_hash(path: Path | None) -> str:
 
 
 def check_agreement(gaussians: Gaussians, views: list[View], subject: Path) -> None:
-    """Refuse Gaussians that do not show what the photos show: they belong to other cameras, axes, units or places.
+    """Refuse Gaussians whose renders do not agree with the photos: they have other cameras, axes, units or places.
 
     Renders and photos are compared without their smooth parts, which exposure changes: their correlation is .98 for
     the bundled scene, .21 with cameras turned by 2 degrees, and about 0 with photos of another place.

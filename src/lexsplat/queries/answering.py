@@ -59,7 +59,7 @@ _WHOLE = 0.5
 
 @dataclass(frozen=True)
 class Searched:
-    """What a phrase is evaluated on.
+    """The scene as the evaluation of a phrase sees it.
 
     Args:
         select: The selection of a thing, by its text.
@@ -135,7 +135,7 @@ def _things(searched: Searched) -> tuple[Selection, ...]:
 
 
 def _colored(phrase: Colored, searched: Searched) -> Selection:
-    """The instances whose main color it is; where there are none, those that have it as well."""
+    """The instances with this main color; if there are none, those that also have it."""
     targets = answer(phrase.target, searched)
     colors = [(searched.colors(each), each) for each in _certain(targets)]
     main = tuple(each for words, each in colors if phrase.color in words[:1])

@@ -1,4 +1,4 @@
-"""What carries what: contact between two selections, by their Gaussians near the place where they meet.
+"""Support between two selections, decided by their Gaussians near the place where they meet.
 
 Bounding boxes of flat things overlap, and Gaussians stray: everything here is a median or a quantile of the parts
 near the meeting place. The side that a thing is on follows from the medians alone, so two things never carry each

@@ -52,7 +52,7 @@ def everyday_words() -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EverydayScale:
-    """What everyday words reach at the codes of a scene.
+    """Scores of everyday words at the codes of a scene.
 
     Args:
         mean: Mean embedding of the words ``[D]``; its cosine with a code is the mean over the words.

@@ -102,7 +102,7 @@ MAX_LENGTH = 600
 
 
 class _IncompleteError(Exception):
-    """A phrase lacks a part; the text of the error is the word that asks for it."""
+    """A phrase is incomplete. The message is the word that is not understood, such as an "on" at its end."""
 
 
 def parse(text: str) -> Phrase:
@@ -161,7 +161,7 @@ def _unhidden(thing: Thing, quoted: list[str]) -> Thing:
 
 
 class _Parser:
-    """Recursive descent: what binds loosest is split first."""
+    """Recursive descent parser: the loosest operators are split first."""
 
     def __init__(self, whole: str, together: bool = False, stated: bool = False) -> None:
         self.whole, self.together, self.stated = whole, together, stated
@@ -246,7 +246,7 @@ class _Parser:
         return replace(pick, target=Except(pick.target, described) if negated else described)
 
     def difference(self, words: str, depth: int) -> Phrase | None:
-        """ "A but not B"; None if it is none. "Toys but not the largest" names toys alone."""
+        """ "A but not B"; None for another phrase. "Toys but not the largest" names toys alone."""
         parts = patterns.EXCEPT.split(f" {words} ", maxsplit=1)
         if len(parts) < 2:
             return None
@@ -268,7 +268,7 @@ class _Parser:
         return without(first, second) or Except(first, second)
 
     def union(self, words: str, depth: int) -> Phrase | None:
-        """ "A and B", "A or B", "A, B"; None if it is none of them."""
+        """ "A and B", "A or B", "A, B"; None for another phrase."""
         parts = patterns.BOTH.split(f" {words} ", maxsplit=1)
         if len(parts) < 2:
             return None
@@ -311,7 +311,7 @@ class _Parser:
         return placed(place, first)
 
     def second_reference(self, first: Related, second: Phrase, joint: str) -> Phrase:
-        """ "What is next to the mug and the duck": things next to both, but on the one or the other."""
+        """ "What is next to the mug and the duck": things next to both. With "on", things on either."""
         if first.relation in ORDERED or not isinstance(second, (Thing, Both, Together)):
             raise _IncompleteError(joint)
         one_of = joint.endswith("or") or first.relation in ("on", "inside", "under", "below")

@@ -1,4 +1,4 @@
-"""What the grammar leaves in a thing although it names no thing: function words, numbers, comparisons, places.
+"""Words that the grammar leaves over and that name no thing: function words, numbers, comparisons, places.
 
 The words are of closed classes, so the rule holds for phrasings that nobody has thought of. A fixed noun phrase keeps
 its words: "cup of tea", "mug with a handle", "something to sit on", "table with four legs".
@@ -123,7 +123,7 @@ def left_over(text: str) -> str:
 
 
 def _size(text: str) -> str:
-    """A size that is asked of no certain thing: "big toys", "something small red"."""
+    """A size word without a noun to compare: "big toys", "something small red"."""
     words = text.lower().split()
     sizes = _SIZES if len(words) > 1 and (words[0] == "something" or is_kind(words[-1])) else _RELATIVE
     return next((word for word in words[: len(words) - 1] if word in sizes.split()), "")

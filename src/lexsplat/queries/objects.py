@@ -69,6 +69,6 @@ def whole_segments(codes: SegmentCodes, strengths: Strengths, words: int) -> Who
 
 
 def name_probabilities(strengths: FloatArray) -> FloatArray:
-    """Probabilities of words ``[W]`` from their strengths; what is left to 1 is the probability of no word."""
+    """Probabilities of words ``[W]`` from their strengths; the rest up to 1 is the probability of no word."""
     odds = np.exp(_SLOPE * (strengths - FITS))
     return np.asarray(odds / (1 + odds.sum()))

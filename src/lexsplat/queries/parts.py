@@ -53,7 +53,7 @@ FloatArray = NDArray[np.float64]
 
 @torch.no_grad()
 def with_parts(thing: Tensor, taken: Tensor, gaussians: Gaussians, labels: Tensor) -> Tensor:
-    """A thing with the segments beside it that are taken for a part of it ``[N]`` bool.
+    """A thing with the adjacent segments that are taken for a part of it ``[N]`` bool.
 
     The name of a bottle may describe it without its cork.
 
@@ -77,7 +77,7 @@ def with_parts(thing: Tensor, taken: Tensor, gaussians: Gaussians, labels: Tenso
 
 @torch.no_grad()
 def part_scores(relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: Tensor) -> Tensor | None:
-    """Scores of a part; None if nearly all of its thing is described as the part, so that there is nothing to cut.
+    """Scores of a part; None if nearly all of its thing is described as the part and nothing is to be cut.
 
     Args:
         relevancy: Relevancy of each Gaussian by itself ``[N]`` in 0..1.

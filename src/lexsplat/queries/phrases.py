@@ -1,4 +1,4 @@
-"""What a phrase asks for: things, and the relations between them. `lexsplat.queries.grammar` parses text into it."""
+"""Parsed phrases: things, and the relations between them. `lexsplat.queries.grammar` parses text into them."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ class Pick:
 
 @dataclass(frozen=True)
 class AtLeast:
-    """All instances of ``target`` if there are as many as asked for, and at most ``most`` if that is given."""
+    """All instances of ``target`` if there are at least ``count``, and at most ``most`` if given; otherwise none."""
 
     count: int
     target: Phrase
@@ -310,7 +310,7 @@ def in_place_of(second: Phrase, first: Phrase) -> Phrase:
 
 
 def loosened(phrase: Phrase, together: bool) -> Phrase:
-    """The phrase with the union in place of `Together`, but where a whole question asks for both."""
+    """The phrase with the union in place of `Together`, except if a whole question asks for both."""
     parts = parts_of(phrase)
     keeps = together and isinstance(phrase, Together)
     changed: dict[str, Any] = {name: loosened(part, keeps) for name, part in parts.items()}

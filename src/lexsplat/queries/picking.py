@@ -1,4 +1,4 @@
-"""From a click to a selection: the surface at the pixel, and what is connected to it and means the same."""
+"""From a click to a selection: the surface at the pixel, and connected Gaussians with the same language."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def select_hit(
     cameras: Mapping[str, Camera],
     world: World | None = None,
 ) -> Selection:
-    """The connected Gaussians around a hit that mean the same.
+    """The connected Gaussians around a hit with the same language.
 
     Args:
         hit: From `surface_at`.

@@ -1,4 +1,4 @@
-"""Whether the scene holds what a phrase names: a "not in this scene" that needs no fit to an encoder.
+"""Presence: whether the scene holds the thing that a phrase names, without calibration to an encoder.
 
 Every phrase has a best place in every scene, even if the object is absent. Presence is decided by how well the phrase
 describes that place, on the scale of everyday words (`lexsplat.queries.everyday`):
@@ -179,7 +179,7 @@ class PresenceClassifier:
 
     @property
     def tables(self) -> dict[str, Tensor]:
-        """What published pages need: distributions ``[V, K]`` of objects, and the best heights for colors ``[K]``."""
+        """Tables for pages: distributions ``[V, K]`` of objects, and the best heights for colors ``[K]``."""
         return {"places": self.places.distributions, "best_colored": self._best_colored}
 
     def strengths(self, texts: Tensor, places: Tensor) -> NDArray[np.float64]:

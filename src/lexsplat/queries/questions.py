@@ -1,4 +1,4 @@
-"""Questions and requests as phrases: the words around the thing are taken off."""
+"""Questions and requests as phrases: removes the words around the thing."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ _LEFT_OVER = re.compile(
     rf"^(?:can(?! (?:of|openers?)\b)|will|may|might|please)(?= \w)|^(?:turn|switch|go|move|walk)$|^something to {_SEE}$|(?<=something ){_ANY}\b.*",
     re.IGNORECASE,
 )
-"""Words of a question that stay in a thing when no frame takes them off, beside those of `leftovers`."""
+"""Words of a question that stay in a thing when no frame takes them off, in addition to those of `leftovers`."""
 _HOW_LARGE = re.compile(
     r"^(?:.*\b)?how (?:big|large|small|tall|short|high|low|wide|long|deep|thick) (?:is|are) (?!.*\bthan\b)|"
     r"\b(?:sizes?|heights?|widths?|lengths?|dimensions) of\b",
@@ -289,7 +289,7 @@ def as_phrase(words: str) -> str:
 
 
 def not_understood(words: str) -> str:
-    """What of a question or a sentence is left in words that should name a thing; "" if nothing."""
+    """Words of a question left over where a thing should be named; "" if none."""
     found = _LEFT_OVER.search(words)
     return found[0] if found else left_over(words)
 
@@ -300,7 +300,7 @@ def asks_yes_or_no(words: str) -> bool:
 
 
 def not_in_answer(words: str) -> str:
-    """A note on what a question asks for beside a thing and its place; "" if nothing."""
+    """A note on what a question asks for in addition to a thing and its place; "" if nothing."""
     if re.match(r"(?:of )?(?:what|which) colou?rs?\b.*\b(?:is|are|has|have)\b", words, re.IGNORECASE):
         return 'the answer is the thing: "lexsplat list" tells colors'
     if _HOW_LARGE.search(words):

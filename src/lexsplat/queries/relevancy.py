@@ -169,7 +169,7 @@ def check_prompts(prompts: str | Sequence[str]) -> list[str]:
 
 
 def _flaw(text: str) -> str:
-    """What a text is if it is no word or phrase; "" if it is one."""
+    """Why a text is not a word or phrase, as the "found" of an error; "" if it is one."""
     if not text.strip():
         return "an empty text"
     # Bytes of the command line that are not UTF-8 arrive as lone surrogates.

@@ -1,4 +1,4 @@
-"""What the views of a scene show of its segments: from it come best views and hidden Gaussians, without rendering.
+"""Visibility of segments in the views of a scene. It gives best views and hidden Gaussians without rendering.
 
 Rendering is linear in what Gaussians carry, so the share of an image that a selection covers is a sum over its
 Gaussians. The sums of whole segments are kept, view by view. A selection covers of each segment what it has of the

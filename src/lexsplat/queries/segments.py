@@ -1,4 +1,4 @@
-"""Relevancy by segments: whole segments are taken or left (`lexsplat.language.segments`).
+"""Relevancy by segments: whole segments are selected or not (`lexsplat.language.segments`).
 
 Each level of the hierarchy is tried. The score of a segment is the mean of its Gaussians, weighted by what the
 training views show of them. A cut through the sorted scores separates segments that are taken from those that are

@@ -280,7 +280,7 @@ class Selection:
         return replace(self, mask=union(self.mask, kept), parts=kept)
 
     def convincing_limit(self, best: float) -> float:
-        """The smallest score of an instance beside one that scores ``best``: `CONVINCING`, in log-odds."""
+        """The smallest score of an instance if the best one scores ``best``: `CONVINCING`, in log-odds."""
         low, high = (
             math.log(p / (1 - p)) for p in (min(max(p, 1e-6), 1 - 1e-6) for p in (self.threshold, best))
         )

@@ -89,7 +89,7 @@ def corrected(phrase: str, vocabulary: Iterable[str]) -> str:
 
 
 def spellings(phrase: str, vocabulary: Iterable[str]) -> tuple[str, ...]:
-    """What a phrase may mean, the likeliest first: words of the vocabulary for similar words in no dictionary.
+    """Corrections of a phrase, the likeliest first: words of the vocabulary replace similar words in no dictionary.
 
     A word that the dictionary knows is corrected only if the vocabulary has one that differs by a doubled letter
     ("stripped", "striped"), by two neighbors in the other order ("appel"), or by the last of six letters ("orang").
@@ -136,7 +136,7 @@ def _is_typed_wrong(word: str) -> bool:
 
 
 def _meant(word: str, known: set[str]) -> Sequence[str]:
-    """What a word may mean, the likeliest first."""
+    """Corrections of a word, the likeliest first."""
     small = word.lower()
     if len(small) < 3 or small in known or not small.isalpha() or _singular_word(small) in known:
         return (word,)

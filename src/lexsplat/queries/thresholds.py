@@ -102,8 +102,8 @@ def scene_thresholds(
     The thresholds are `automatic_threshold` of small renderings of `THRESHOLD_VIEWS` evenly chosen views. Prompts
     that the scene does not hold get 0.5, where next to nothing is marked: they have no two classes, and a cut would
     mark whatever resembles the prompt a little more than the rest, such as a whole table for a mug's handle that the
-    encoder does not see. "unsure" prompts keep their cut: a guess with the doubt beside it is more useful than an
-    empty image.
+    encoder does not see. "unsure" prompts keep their cut: a guess marked as doubtful is more useful than an empty
+    image.
 
     Args:
         relevancy: Renders the maps ``[P, H, W]`` of the prompts in a view.

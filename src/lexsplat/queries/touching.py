@@ -1,4 +1,4 @@
-"""Things of one kind that stand side by side and touch: which pieces of a cluster count as things of their own.
+"""Things of one kind that stand side by side and touch: divides a cluster into single things.
 
 The pieces are found by k-means in the horizontal plane, because things stand beside each other and parts lie above
 each other as well. They are things if

@@ -1,4 +1,4 @@
-"""Whose left it is: the views that show two things decide, weighted by how much of them they show."""
+"""The viewer of left and right: the views that show two things vote, weighted by how much of them they show."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Viewers:
 
     @property
     def seen_from(self) -> str:
-        """Whose left it was, for people: "view_012", or "most views, such as view_012"."""
+        """The views that left and right refer to, in words: "view_012", or "most views, such as view_012"."""
         if self.chosen is not None:
             return view_name(self.chosen, self.like.cameras)
         if not self._taken:
@@ -73,7 +73,7 @@ class Viewers:
 
     @cached_property
     def _one(self) -> Frame:
-        """The only frame there is: that of the chosen viewer, or, of relations without a viewer, any."""
+        """The only frame: that of the chosen viewer, or any frame for relations without a viewer."""
         return frame_of(self.chosen, self.like.up.direction)
 
     @cached_property

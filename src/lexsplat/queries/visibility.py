@@ -41,7 +41,7 @@ def hidden_gaussians(gaussians: Gaussians, cameras: Sequence[Camera], masses: Te
 
 @torch.no_grad()
 def shown_shares(gaussians: Gaussians, cameras: Sequence[Camera], masses: Tensor) -> NDArray[np.float64]:
-    """What the views show of each Gaussian, as a share of what they would show without the others ``[N]``.
+    """Visible weight of each Gaussian as a share of its weight without the others ``[N]``.
 
     Args:
         gaussians: The scene.
@@ -74,7 +74,7 @@ def _alone(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 
 def without_hidden(chosen: Selection, hidden: Tensor) -> Selection:
-    """What can be seen of a selection. Hidden Gaussians still link what they connect, such as a lamp and its foot."""
+    """The visible part of a selection. Hidden Gaussians still link what they connect, such as a lamp and its foot."""
     if not bool(hidden[chosen.indices].any()):
         return chosen
     return replace(chosen, mask=chosen.mask & ~hidden, parts=tuple(chosen.instances))
@@ -82,7 +82,7 @@ def without_hidden(chosen: Selection, hidden: Tensor) -> Selection:
 
 @torch.no_grad()
 def whole_things(chosen: Selection, hidden: Tensor, segments: Segments | None) -> Selection:
-    """A selection with what belongs to its things besides: their borders, and the hidden Gaussians in them.
+    """A selection extended by the borders of its things and the hidden Gaussians in them.
 
     A segment belongs to it if half of what the views show of the segment is selected, and a hidden Gaussian if two of
     its six nearest neighbors that can be seen are.

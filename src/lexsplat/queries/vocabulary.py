@@ -1,4 +1,4 @@
-"""Everyday names: what "thing" can be, what typing errors are compared with, what the viewer suggests."""
+"""Everyday names: for "thing", for the correction of typing errors, and for suggestions of the viewer."""
 
 from __future__ import annotations
 
@@ -80,5 +80,5 @@ def thing_of_part(phrase: str) -> str:
 
 
 def default_vocabulary(clip: str = "") -> list[str]:
-    """Everyday things, or what the bundled encoder was trained on."""
+    """Everyday things, or the things on which the bundled encoder is trained."""
     return words(_BUNDLED if clip == "bundled" else _EVERYDAY)

@@ -13,7 +13,7 @@ from lexsplat.queries.vocabulary import COLORS, QUALITIES
 
 
 def own_words(left: str, plain: str) -> str:
-    """What of a text was not understood, in its own letters: the first of several that is in it."""
+    """Words of a text that were not understood, as the text spells them."""
     shown = " ".join(patterns.HIDDEN.sub(" ", plain).split())
     short = re.search(r"\b\w+n['\u2019\u02bc]t\b", shown)
     if short and short[0].lower().startswith(tuple(left.lower().split())):  # don't
@@ -65,7 +65,7 @@ def picked(found: re.Match[str]) -> PickName:
 
 
 def number(word: str) -> int:
-    """What a numeral says; "several" and the like are two."""
+    """Value of a numeral; "several" and the like are two."""
     small = word.lower()
     if digits := re.match(r"\d+", small):
         return int(digits[0])

@@ -88,5 +88,5 @@ def check_gaussians(config: ReconstructionConfig, device: torch.device | str, me
     cap = config.cap(device)
     room = memory // 2 // budget.GAUSSIAN_BYTES
     need = 2 * cap * budget.GAUSSIAN_BYTES
-    what, remedy = f"{cap:,} Gaussians beside the photos", f"reconstruction.max-gaussians {room}"
+    what, remedy = f"{cap:,} Gaussians in addition to the photos", f"reconstruction.max-gaussians {room}"
     budget.require("reconstruct", need, memory, what, remedy)

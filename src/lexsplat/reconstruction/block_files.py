@@ -273,7 +273,7 @@ class CellFiles:
         return found
 
     def room(self, number: int) -> tuple[int, ...] | None:
-        """What `write_room` wrote for a round; None if nothing."""
+        """The numbers that `write_room` wrote for a round; None if it wrote none."""
         path = self._room_path(number)
         return tuple(read_json(path)["gaussians"]) if path.exists() else None
 

@@ -96,7 +96,7 @@ class BlockRun:
 
 @dataclass(frozen=True)
 class _Shared:
-    """What the visits of a group read."""
+    """Inputs shared by the visits of a group."""
 
     capture: Capture
     config: ReconstructionConfig
@@ -231,7 +231,7 @@ def adam_steps(config: ReconstructionConfig, name: str, step: int) -> int:
 def reconstruct_blocks(
     capture: Capture, config: ReconstructionConfig, points: InitialPoints, up: Up, count: int, run: BlockRun
 ) -> Gaussians:
-    """Reconstruct a capture block by block; a run that was killed goes on after the last finished visits.
+    """Reconstruct a capture block by block; a killed run resumes after the last finished visits.
 
     Args:
         capture: Views and split.
@@ -294,7 +294,7 @@ def reconstruct_blocks(
 
 
 def _seen_by(group: list[Visit], capture: Capture) -> Capture:
-    """What workers need of the capture: the views of a group of visits."""
+    """The part of the capture that workers need: the views of a group of visits."""
     views = {name: capture.views[name] for visit in group for name in visit.block.views}
     none, colors = capture.points[:0], capture.point_colors[:0]
     names = tuple(sorted(views))
@@ -316,7 +316,7 @@ def _write_start(
 def _room(
     files: CellFiles, number: int, groups: int, config: ReconstructionConfig, cap: int
 ) -> tuple[int, ...]:
-    """How many Gaussians round ``number`` of density control may add to each cell.
+    """Number of Gaussians that round ``number`` of density control may add to each cell.
 
     Within the cap of the whole, those with the largest gradients grow. The numbers are kept in a file, because a run
     that was killed in a round goes on with those of its start.
@@ -388,7 +388,7 @@ def _trained(shared: _Shared, visit: Visit) -> int:
     after = {cell: state.select(torch.from_numpy(cells == cell)) for cell in block.trained}
     files.write(visit.number, after, exposures)
     del trainer, around, state, after
-    budget.give_back_freed()  # what the next visit gets would otherwise lie beside it
+    budget.give_back_freed()  # otherwise the next visit's memory would come on top of it
     return len(cells)
 
 

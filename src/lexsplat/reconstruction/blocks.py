@@ -1,4 +1,4 @@
-"""How a capture is cut into blocks: its Gaussians into cells of the ground plane, its views into groups.
+"""Division of a capture into blocks: its Gaussians into cells of the ground plane, its views into groups.
 
 The ground plane is cut into cells with equal numbers of points, and the views, by where they stand, into as many
 groups of equal size. A block is a group of views and the few cells that fill most of their pixels. The Gaussians of

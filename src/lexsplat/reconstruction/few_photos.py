@@ -1,4 +1,4 @@
-"""Few photos: more initial points than structure from motion finds, and how far new views can be trusted.
+"""Few photos: more initial points than structure from motion finds, and the expected quality of new views.
 
 Few photos give few points, and a short training cannot fill the places between them. Points at the depths of their
 neighbors in a photo start it close to the surfaces.
@@ -89,7 +89,7 @@ def _points_of(
 
 
 def warn_of_few_photos(capture: Capture, gaussians: Gaussians) -> None:
-    """Log how far new views of few photos can be trusted: by the held-out photos, if there are any."""
+    """Log the expected quality of new views of few photos, from the held-out photos if there are any."""
     measured = ""
     if capture.test_views:
         trained, held_out = (

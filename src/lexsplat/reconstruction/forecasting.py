@@ -1,4 +1,4 @@
-"""How long a reconstruction takes, measured on a few steps before it begins."""
+"""Time estimate of a reconstruction, measured on a few steps beforehand."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ with "default", and by definition with "mcmc"."""
 
 
 def tell_time(capture: Capture, config: ReconstructionConfig, points: InitialPoints, **options: Any) -> None:
-    """Log how long a reconstruction will take (`forecast`, whose options these are); short ones are not told."""
+    """Log the estimated time of a reconstruction (`forecast`, whose options these are) unless it is short."""
     if config.iterations >= _TOLD_FROM:
         seconds = forecast(capture, config, points, **options)
         tell(STAGE, seconds, f"{config.iterations:,} iterations")
@@ -99,7 +99,7 @@ def _counts(config: ReconstructionConfig, start: int, cap: int) -> NDArray[np.fl
 
 
 def _grown(points: InitialPoints, count: int) -> InitialPoints:
-    """As many points as there may be Gaussians: copies beside the given ones, at about their distance."""
+    """As many points as there may be Gaussians: copies near the given ones, at about their distance."""
     repeats = max(1, -(-count // len(points.points)))
     generator = np.random.default_rng(0)
     spread = 0.01 * points.points.std(0)

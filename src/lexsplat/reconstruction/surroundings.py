@@ -1,6 +1,6 @@
-"""What the views of a visit show of the cells that it does not train: Gaussians with fixed values, thinned by image.
+"""Gaussians of untrained cells in the views of a visit: their values are fixed, and each image samples them.
 
-A Gaussian that is small in an image takes part in it by chance, enlarged to make up for those that do not. The number
+Gaussians that are small in an image are sampled at random and enlarged to cover the same total area. The number
 in an image thus depends on what it shows, not on the size of the capture.
 """
 
@@ -29,7 +29,7 @@ class Surroundings:
     """Gaussians that take part with fixed values.
 
     Args:
-        gaussians: Those that take part in at least one image.
+        gaussians: Those used in at least one image.
         extents: Their centers, largest standard deviations, and second largest ones, ``[N, 5]`` on the host.
         draws: Random numbers ``[N]`` in 0..1. A Gaussian takes part in an image if its share there is larger.
     """
@@ -42,7 +42,7 @@ class Surroundings:
     def seen(
         cls, cells: Iterable[Gaussians], cameras: Sequence[Camera], rng: np.random.Generator
     ) -> Surroundings:
-        """What cameras see of the Gaussians of some cells, one cell after the other."""
+        """Select the Gaussians of other cells that the cameras see, one cell after the other."""
         from lexsplat.reconstruction.surroundings_kernels import largest_shares
 
         parts, extents, draws, images = [], [], [], _images(cameras)
@@ -63,7 +63,7 @@ class Surroundings:
         return replace(self, gaussians=self.gaussians.to(device))
 
     def in_image(self, camera: Camera) -> Gaussians:
-        """Those that take part in an image, each enlarged to the area of all that it stands for."""
+        """The sample for an image. Each Gaussian is enlarged to the area of all those that it stands for."""
         shares = shares_in_images([camera], self.extents)[0]
         taking = np.flatnonzero(self.draws < shares)
         part = self.gaussians.select(torch.from_numpy(taking).to(self.gaussians.device))
@@ -78,7 +78,7 @@ def extents_of(gaussians: Gaussians) -> NDArray[np.float32]:
 
 
 def shares_in_images(cameras: Sequence[Camera], extents: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Chance ``[C, N]`` of Gaussians to take part in images: their area over that of `SMALL`, at most 1.
+    """Probability ``[C, N]`` that a Gaussian is used in an image: its area over that of `SMALL`, at most 1.
 
     It is 0 outside of an image. Gaussians reach three deviations far; some that are just outside count as inside.
     """
@@ -88,7 +88,7 @@ def shares_in_images(cameras: Sequence[Camera], extents: NDArray[np.float32]) ->
 
 
 def _images(cameras: Sequence[Camera]) -> NDArray[np.float32]:
-    """What the kernels read of cameras, ``[C, 18]``."""
+    """Cameras as the kernels read them, ``[C, 18]``."""
     return np.array(
         [
             [*camera.viewmat[:3].ravel(), *camera.K[(0, 1, 0, 1), (0, 1, 2, 2)], camera.width, camera.height]

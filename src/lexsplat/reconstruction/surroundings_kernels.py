@@ -1,4 +1,4 @@
-"""How large Gaussians are in images, pair by pair without arrays between (Numba, CPU).
+"""Sizes of Gaussians in images, computed pair by pair without intermediate arrays (Numba, CPU).
 
 This module is separate from `surroundings` so that Numba is imported only when a block is trained.
 """

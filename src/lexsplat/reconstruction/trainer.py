@@ -22,6 +22,7 @@ from lexsplat.reconstruction.settings import REFERENCE_ITERATIONS, Reconstructio
 from lexsplat.runtime.errors import TrainingError
 from lexsplat.runtime.memory import DEFAULT_MEMORY
 from lexsplat.runtime.progress import Listener, silent
+from lexsplat.runtime.sampling import evenly
 from lexsplat.runtime.training import run_training
 
 if TYPE_CHECKING:
@@ -242,9 +243,8 @@ class Reconstructor:
 
         gaussians = self.gaussians()
         weights = torch.zeros(len(gaussians), device=self.device)
-        places = torch.linspace(0, len(self._names) - 1, WEIGHED_VIEWS).round().long().unique().tolist()
-        for place in places:
-            weights += accumulate_weights(gaussians, self._views[self._names[place]].camera)
+        for name in evenly(self._names, WEIGHED_VIEWS):
+            weights += accumulate_weights(gaussians, self._views[name].camera)
         mask = torch.zeros(len(weights), dtype=torch.bool, device=self.device)
         mask[torch.argsort(weights, stable=True)[:number]] = True
         return mask

@@ -33,7 +33,7 @@ def _array(tensor: Tensor) -> NDArray[Any]:
 
 
 def _zeros(*shape: int) -> Tensor:
-    """Zeros from fresh pages; ``torch.zeros`` would start torch's threads, which then spin beside ours."""
+    """Zeros from fresh pages; ``torch.zeros`` would start torch's threads, which then compete with ours."""
     return torch.from_numpy(np.zeros(shape, np.float32))
 
 

@@ -1,4 +1,4 @@
-"""What rendering returns, and what its steps hand to each other."""
+"""Results of rendering and of its steps."""
 
 from __future__ import annotations
 

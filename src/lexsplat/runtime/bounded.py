@@ -1,4 +1,4 @@
-"""A bounded memory of what was computed, for many threads."""
+"""A bounded, thread-safe cache of computed values."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ V = TypeVar("V")
 
 
 class Bounded(Generic[K, V]):
-    """A mapping that forgets what was used least recently. All methods may be called from any thread.
+    """A mapping that drops the least recently used entries. All methods may be called from any thread.
 
     Args:
         limit: Largest number of entries.
@@ -34,7 +34,7 @@ class Bounded(Generic[K, V]):
             return self._entries.get(key)
 
     def put(self, key: K, value: V) -> V:
-        """Keep an entry; the first one stays where two threads have made the same."""
+        """Keep an entry; if two threads make the same one, the first stays."""
         with self._lock:
             kept = self._entries.setdefault(key, value)
             self._entries.move_to_end(key)
@@ -43,6 +43,6 @@ class Bounded(Generic[K, V]):
             return kept
 
     def get_or_make(self, key: K, make: Callable[[], V]) -> V:
-        """The entry; made outside the lock where there is none."""
+        """Return the entry; if missing, create it outside the lock."""
         found = self.get(key)
         return self.put(key, make()) if found is None else found

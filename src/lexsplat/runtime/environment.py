@@ -42,7 +42,8 @@ def versions() -> dict[str, str]:
 
 
 def user_cache() -> Path:
-    """The user's folder for what can be made again: ``$XDG_CACHE_HOME/lexsplat``, by default ``~/.cache/lexsplat``.
+    """The user's folder for files that can be recomputed: ``$XDG_CACHE_HOME/lexsplat``, by default
+    ``~/.cache/lexsplat``.
 
     Raises:
         RuntimeError: If the user has no home directory.

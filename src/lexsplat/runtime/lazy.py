@@ -1,4 +1,4 @@
-"""Loading modules quickly: packages import their public names at first use, and no collector runs meanwhile."""
+"""Loading modules quickly: packages import their public names at first use, without garbage collection."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def duration(seconds: float) -> str:
 
 
 def tell(stage: str, seconds: float, amount: str) -> None:
-    """Log how long a stage will take, if it takes two seconds or more.
+    """Log the estimated time of a stage of two seconds or more.
 
     Args:
         stage: Name of the stage.
@@ -119,7 +119,7 @@ def tell(stage: str, seconds: float, amount: str) -> None:
 
 
 class FirstUnits:
-    """Tells how long a stage will take, once its first units are done, where all units take about as long.
+    """Estimates the time of a stage from its first units, if all units take about as long.
 
     Args:
         stage: Name of the stage.

@@ -1,4 +1,4 @@
-"""How this process comes to a Ray: a running cluster, or one of its own."""
+"""Connection of this process to Ray: a running cluster, or one of its own."""
 
 from __future__ import annotations
 

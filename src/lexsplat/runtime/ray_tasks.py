@@ -1,4 +1,4 @@
-"""Tasks on Ray: what they ask of a node, how many are sent at a time, and what came of each."""
+"""Tasks on Ray: their resources, the number sent at a time, and their outcomes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Answer = tuple[Outcome, list[tuple[int, str]]]
 
 
 def slots(needs: Needs) -> int:
-    """How many tasks with these needs the nodes of the cluster hold at a time."""
+    """Number of tasks with these needs that the nodes of the cluster can run at a time."""
     found = 0.0
     for node in _nodes():
         fits = node.get("CPU", 0.0)
@@ -47,7 +47,7 @@ def slots(needs: Needs) -> int:
 
 
 def _nodes() -> list[dict[str, float]]:
-    """The resources of every node that lives."""
+    """The resources of every live node."""
     import ray
 
     return [node["Resources"] for node in ray.nodes() if node["Alive"]]
@@ -97,7 +97,7 @@ class Tasks:
         return bool(ended)
 
     def take(self, name: str) -> Answer | None:
-        """The answer of a task that has ended; None if it is being done again because its result was lost."""
+        """The answer of a task that has ended; None if it is repeated because its result was lost."""
         import ray
 
         reference = self.sent[name]

@@ -36,7 +36,7 @@ class ClusterLostError(WorkersError):
 
     @classmethod
     def by(cls, error: Exception | None = None) -> ClusterLostError:
-        """The error to raise, of what Ray raised if it did."""
+        """The error to raise, made from Ray's error if there is one."""
         return cls(
             "--workers",
             expected="the cluster",
@@ -59,7 +59,7 @@ for _ in range(0 if sys.stdin.read() else seconds):
 
 
 class HeadWatch:
-    """A thread that connects to the head node again and again while the context is open, and a witness of the end.
+    """A thread that repeatedly connects to the head node while the context is open.
 
     Args:
         address: "HOST:PORT" of the head; None watches nothing.

@@ -115,7 +115,7 @@ class RayWorkers:
         """See `Workers.map`. Tasks are sent while slots are free, though an earlier one is still at work.
 
         Raises:
-            WorkersError: If the cluster disappears, or no node has what a task needs, also after a wait.
+            WorkersError: If the cluster disappears, or even after a wait no node has what a task needs.
         """
         import ray
 
@@ -191,7 +191,7 @@ def _check_nodes(paths: tuple[Path, ...]) -> int:
 
 
 def _on_every_node(task: Any, argument: Any) -> dict[str, Any]:
-    """References to the answers of all nodes that can compute, by the name of the node."""
+    """References to the answers of all nodes that can run tasks, by the name of the node."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy as OnNode
 
@@ -224,7 +224,7 @@ def _check_probe(node: str, found: str, code: str, missing: list[str]) -> None:
 
 
 def _compare(node: str, packages: dict[str, str]) -> None:
-    """Warn of packages whose versions on a node are others, so that its results may have other bits."""
+    """Warn of packages with other versions on a node, so that its results may have other bits."""
     own = versions()
     others = [
         f"{name} {packages.get(name, 'missing')} (here {own.get(name, 'missing')})"

@@ -301,7 +301,7 @@ class DivergenceGuard:
         self._training.rate_factor /= 2
         self._keep()  # diverging again from here halves the rates again
         log.warning(
-            "%s diverged (%s): went back %d steps to the last good state, learning rates now %g of the settings",
+            "%s diverged (%s): restored the state %d steps back; learning rates are now %g times the configured ones",
             self._name,
             error.found or error,
             lost,

@@ -1,4 +1,4 @@
-"""Work that is a map over views, blocks or scenes: in this process, or on Ray where ``--workers`` asks for it.
+"""Maps over views, blocks or scenes: in this process, or on Ray with ``--workers``.
 
 Results arrive in the order of the items, whichever worker finishes first. What is added up from them is therefore
 added in one order, and any number of workers gives the same bits.
@@ -26,7 +26,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Needs:
-    """What one task needs of the machine that it runs on.
+    """Resources that one task needs.
 
     Args:
         memory: Host memory in bytes; 0 leaves it to the engine.
@@ -51,7 +51,7 @@ class Outcome:
     Args:
         name: Name of its item.
         result: What it returned; None if it failed.
-        error: Why it failed, for a reason of its own. A lost worker is no such reason: the task is done again.
+        error: Why the task itself failed. A lost worker is not a failure: the task is repeated.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Outcome:
 
 
 def attempt(work: Callable[[S, T], R], shared: S, name: str, item: T) -> Outcome:
-    """Do one task; whatever it raises is its outcome, except what ends the program."""
+    """Run one task; any exception is its outcome, except those that end the program."""
     try:
         return Outcome(name, work(shared, item))
     except LexsplatError as error:
@@ -211,7 +211,7 @@ def check_spec(spec: str) -> None:
 
 @dataclass(frozen=True)
 class SharedFolder:
-    """A folder of results that workers write to where they see it; where they do not, files travel with the tasks.
+    """A folder of results. Workers that see it write to it; for others, files travel with the tasks.
 
     Args:
         path: The folder, absolute.

@@ -40,7 +40,7 @@ MAX_DEFAULT_VIEWS = 6
 
 @dataclass(eq=False)
 class Word:
-    """What a scene keeps of a prompt.
+    """Cached answers to one prompt.
 
     Args:
         scores: Relevancy of every Gaussian ``[N]`` in 0..1, in the form of the query.
@@ -239,7 +239,7 @@ def answer_queries(
 
 
 def in_own_words(prompt: str, clip: str) -> Understood:
-    """What is known of a prompt that is asked in its own words.
+    """How a prompt is understood that is asked in its own words.
 
     The note says what to ask in place of a question or a phrase with grammar.
     """
@@ -254,7 +254,7 @@ def in_own_words(prompt: str, clip: str) -> Understood:
 
 
 def rests_on(scene: Scene) -> str:
-    """What relevancy and presence in a scene are relative to, for people."""
+    """The phrases that relevancy and presence are relative to, in words."""
     words = f"{len(everyday_words()):,} everyday words in this scene"
     return (
         words if scene.query.everyday else f"relevancy: {', '.join(scene.query.compared)}; presence: {words}"

@@ -84,7 +84,7 @@ def _predictable(image: FloatArray, found: FloatArray, weights: FloatArray, widt
 
 
 def self_similar_shifts(pattern: FloatArray, weights: FloatArray, trust: FloatArray) -> list[tuple[int, int]]:
-    """The shifts (rows, columns) by which an image resembles itself best, best first.
+    """The shifts (rows, columns) of highest self-similarity of an image, best first.
 
     Args:
         pattern: The image ``[H, W, C]``.

@@ -302,7 +302,7 @@ class Editor:
 
     @contextmanager
     def _change(self, entry: dict[str, Any]) -> Iterator[None]:
-        """A change that is journaled as a whole, or not made at all."""
+        """A change that is journaled as a whole or not made."""
         before = self.scene, [*self.steps], [*self.undone]
         try:
             yield

@@ -22,7 +22,7 @@ def is_of_chosen_views(record: Mapping[str, Any]) -> bool:
 
 
 def _chosen_views(record: Mapping[str, Any]) -> dict[str, Any] | None:
-    """From which splats the views of a scene were chosen, and how much they show; None for photos."""
+    """The splats from which the views of a scene were chosen, and their coverage; None for photos."""
     if not is_of_chosen_views(record):
         return None
     names = ("splats", "views", "candidates", "visible", "unseen", "floaters")

@@ -57,7 +57,7 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
 
 
 def _tokens_over(scene: Scene, text: str) -> int:
-    """How many tokens of a text the encoder cuts off; 0 if the encoder has no limit that is known."""
+    """Number of tokens of a text that the encoder truncates; 0 if its limit is unknown."""
     if len(text) <= _SHORT or scene.given_encode_text is not None:
         return 0
     return int(getattr(scene.preload(), "tokens_over", lambda _: 0)(text))

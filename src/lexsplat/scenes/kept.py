@@ -1,4 +1,4 @@
-"""What a scene keeps on disk so that its first questions are fast: what its views show, its words, and its objects.
+"""Results that a scene keeps on disk to make its first questions fast: visibility of segments, words, objects.
 
 ``checkpoints/seen.safetensors`` names the Gaussians, segments and cameras that it was computed from, and
 ``checkpoints/objects.safetensors`` also the encoder, vocabularies and query. Both are written whole or not at all,
@@ -55,7 +55,7 @@ class KeptObjects:
 
 
 def seen_of(scene: Scene) -> Seen | None:
-    """What the views of a scene show of its segments, from disk where it is kept; None without segments."""
+    """Visibility of segments in the views of a scene, from disk if kept there; None without segments."""
     segments = scene.field.segments
     if segments is None:
         return None

@@ -118,7 +118,7 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
 
 
 def _shown(scene: Scene) -> torch.Tensor:
-    """What the training views show of each Gaussian ``[N]``; its opacity where that is not known."""
+    """Visible weight of each Gaussian in the training views ``[N]``; its opacity if that is not known."""
     segments = scene.field.segments
     return scene.gaussians.opacities.detach() if segments is None else segments.masses
 
@@ -136,7 +136,7 @@ def list_document(
 
     Args:
         scene: The scene.
-        vocabulary: What objects may be called (`objects_of`).
+        vocabulary: Candidate names of objects (`objects_of`).
         picture: Where the sheet of thumbnails goes; None writes none.
     """
     things = scene.objects if not vocabulary else objects_of(scene, vocabulary)

@@ -69,6 +69,6 @@ def require_current(folder: SceneFolder) -> None:
         raise SceneFolderError(
             folder.root,
             expected="a finished build",
-            found="one at work, or stopped half way",
+            found="a build that is running or was interrupted",
             remedy="wait for it, or run the build again",
         )

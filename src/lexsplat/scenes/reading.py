@@ -1,4 +1,4 @@
-"""Reading a scene folder as a whole, also while a build is changing it."""
+"""Reading a scene folder as a whole, even while a build is changing it."""
 
 from __future__ import annotations
 

@@ -195,7 +195,7 @@ class Scene:
 
     @property
     def everyday_scale(self) -> EverydayScale:
-        """What everyday words reach in the scene; made at first use."""
+        """Scores of everyday words in the scene; computed at first use."""
         if self._scale is None:
             self._scale = EverydayScale.of(self.field.codebook.clip, self.embed(everyday_words()))
         return self._scale
@@ -326,7 +326,7 @@ class Scene:
         return Selection(self.gaussians, self.cameras, mask, scores, **facts)
 
     def click(self, view: str | StoredView | Camera, x: float, y: float) -> Selection:
-        """The surface at a pixel, and what is connected to it and means the same.
+        """The surface at a pixel, and connected Gaussians with the same language.
 
         Args:
             view: The view that was clicked.
@@ -352,7 +352,7 @@ class Scene:
 
     @cached_property
     def seen(self) -> Seen | None:
-        """What its views show of its segments; None for a scene without segments."""
+        """Visibility of its segments in its views; None for a scene without segments."""
         return seen_of(self)
 
     @cached_property

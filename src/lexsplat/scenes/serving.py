@@ -84,7 +84,7 @@ class OpenScene:
                 self._root,
                 expected="the scene that was opened",
                 found="no scene.json: it was moved or deleted",
-                remedy="put it back, or start again with its new place",
+                remedy="restore the folder, or open the scene at its new path",
             ) from error
         return (facts.st_mtime_ns, facts.st_size)
 

@@ -164,7 +164,7 @@ def photographed(
 def looked_up(
     gaussians: Gaussians, gone: Mask, places: FloatArray, cameras: Sequence[Camera], slack: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What some of the views see at places ``[M, 3]``.
+    """Visibility and color of places ``[M, 3]`` in some of the views.
 
     Args:
         gaussians: The scene.

@@ -1,4 +1,4 @@
-"""What the viewer keeps of a scene between visits: the prompts that were asked, and the vocabulary."""
+"""State that the viewer keeps between visits: the prompts that were asked, and the vocabulary."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What pages send, checked: a question about a place, and what to do with it."""
+"""Validated requests of pages: a question about a place, and an action."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MOST_PIXELS = 16_384
 
 @dataclass(frozen=True)
 class Asked:
-    """What a page asks about: a phrase, or what lies at a pixel.
+    """Subject of a request: a phrase, or the thing at a pixel.
 
     Args:
         prompt: The phrase; "" for a click.

@@ -45,7 +45,7 @@ _NAMES = 6
 
 @dataclass(frozen=True)
 class Content:
-    """What pages load.
+    """Files that pages load.
 
     Args:
         manifest: The content of ``manifest.json``.
@@ -125,7 +125,7 @@ class Session:
         return self._reply(selection, notes)
 
     def what_is(self, asked: Asked) -> bytes:
-        """What lies at a pixel, as `ask` answers, with "names" of the vocabulary and the "point" in the header.
+        """The thing at a pixel, as `ask` answers, with "names" of the vocabulary and the "point" in the header.
 
         Raises:
             QueryError: If nothing is there.
@@ -193,7 +193,7 @@ class Session:
         return selection.instances[asked.instance]
 
     def _name(self, asked: Asked) -> str:
-        """What a step is about: "all fruits", or "1 of 2 of all fruits"."""
+        """Name of a step: "all fruits", or "1 of 2 of all fruits"."""
         count = self._select(asked).count if asked.instance is not None else 0
         one = f"{(asked.instance or 0) + 1} of {count} of " if count > 1 else ""
         return one + asked.prompt
@@ -252,7 +252,7 @@ class Session:
                 self._change(action, named, values)
         except ValueError as error:  # numbers that have no meaning for these Gaussians
             raise QueryError(
-                action, expected="Gaussians that can be drawn afterwards", found=str(error)
+                action, expected="Gaussians that can be drawn after the edit", found=str(error)
             ) from error
         except OSError as error:
             raise SceneFolderError(
@@ -268,11 +268,11 @@ class Session:
         return self.content.manifest
 
     def _prepare(self) -> None:
-        """What pages load after a change, made before the change is kept."""
+        """Make the files that pages load after a change, before the change is kept."""
         self._prepared = self._make_content(self.version + 1)
 
     def preview(self, action: str, asked: Asked) -> bytes:
-        """What `edit` would apply to: the number of Gaussians as four bytes, then 1 or 0 for each drawn Gaussian.
+        """Preview of `edit`: the number of Gaussians as four bytes, then 1 or 0 for each drawn Gaussian.
 
         Raises:
             QueryError: If nothing is selected, or the action is none of `CHANGES`.
@@ -286,7 +286,7 @@ class Session:
     def _change(self, action: str, chosen: Selection, values: Mapping[str, Any]) -> None:
         left = {"delete": len(chosen.mask) - len(chosen), "keep": len(chosen)}.get(action, len(chosen.mask))
         if left < 2:
-            raise QueryError(action, expected="at least 2 Gaussians afterwards", found=str(left))
+            raise QueryError(action, expected="at least 2 Gaussians after the edit", found=str(left))
         if action == "recolor":
             self.editor.recolor(chosen, vector(values, "color"), number(values, "strength", 1.0))
         elif action in ("move", "duplicate"):

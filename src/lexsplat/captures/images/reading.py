@@ -222,7 +222,7 @@ def sizes_agree(found: tuple[int, int], expected: tuple[int, int]) -> bool:
 
 
 def misfit(mask: Path, found: tuple[int, int], photo: str, size: tuple[int, int]) -> CaptureError:
-    """The error for a mask whose aspect is not that of its photo, from their widths and heights."""
+    """The error for a mask whose aspect ratio differs from that of its photo."""
     return CaptureError(
         mask,
         expected=f"a mask of {photo}, {size[0]}x{size[1]} pixels or scaled uniformly",

@@ -1,4 +1,4 @@
-"""What every compared method is: an object behind the protocol `Baseline`."""
+"""The protocol of compared methods, `Baseline`."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class Baseline(Protocol):
 
     @property
     def settings(self) -> Any:
-        """Everything beside the seed that decides what `fit` makes; None if nothing does."""
+        """Everything except the seed that the result of `fit` depends on; None if nothing."""
 
     @property
     def knows_prompts(self) -> bool:
         """Whether the prompts of the evaluation are known to it in advance, as classes."""
 
     def fit(self, data: TrainingData, run: BaselineRun) -> Method:
-        """Make what answers prompts."""
+        """Make the object that answers prompts."""

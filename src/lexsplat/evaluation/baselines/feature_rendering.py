@@ -36,7 +36,7 @@ LevelMaps = Callable[[str], tuple[Tensor, list[float]]]
 
 @dataclass(frozen=True)
 class TrainingData:
-    """What the compared methods are fitted to.
+    """Training data of the compared methods.
 
     Args:
         gaussians: The geometry.
@@ -105,7 +105,7 @@ class GaussianFeatures:
         self.method, self.features, self.scales = method, features, scales
 
     def relevancy(self, gaussians: Gaussians, camera: Camera, question: Question) -> Tensor:
-        """Maps ``[P, H, W]``: LERF's relevancy of the rendered feature, times how much is covered."""
+        """Maps ``[P, H, W]``: LERF's relevancy of the rendered feature times the coverage."""
         positives, negatives = unit_texts(question.positives, question.negatives)
         texts, split = torch.cat([positives, negatives]), len(positives)
         maps = []

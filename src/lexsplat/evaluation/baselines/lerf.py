@@ -51,6 +51,7 @@ class LerfConfig:
 def physical_scales(views: TrainingViews, level_maps: LevelMaps, count: int) -> Tensor:
     """Widths ``[S]`` in world units, spaced evenly in the logarithm over the range of the crops."""
     smallest, largest = [], []
+    # Not `evenly`, which takes other views: recorded results depend on these.
     for name in views.names[:: max(1, len(views.names) // 12)]:
         camera, _ = views.prepared(name)
         depth = _depth(views, name)

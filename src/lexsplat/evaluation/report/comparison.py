@@ -120,7 +120,7 @@ def write_comparison(
 
 
 def _cards(methods: Sequence[MeasuredMethod], rows: Sequence[Row]) -> list[tuple[str, str, str]]:
-    """The best values with the names of their methods, and how much was measured."""
+    """The best values with the names of their methods, and the numbers of views and prompts."""
     facts = []
     for key, name in (("mIoU", "best mIoU"), ("mAP", "best mAP"), ("mIoU_oracle", "best oracle mIoU")):
         best = sorted(best_rows(rows, key))

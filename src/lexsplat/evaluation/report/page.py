@@ -1,4 +1,4 @@
-"""``report.html`` of one scene. Worst cases come first: they are what a reader can learn from."""
+"""``report.html`` of one scene. Worst cases come first, because a reader learns most from them."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ _PROVENANCE = (
 
 
 def _provenance(config: Mapping[str, Any], machine: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What is needed to repeat the numbers: seed, models, machine, ground truth, versions."""
+    """Facts needed to reproduce the numbers: seed, models, machine, ground truth, versions."""
     known = {**config, **machine}
     pairs = [(name, _words(known[name])) for name in _PROVENANCE if known.get(name) is not None]
     if ground_truth := known.get("ground_truth"):

@@ -177,7 +177,7 @@ class CodeField:
         )
 
     def facts(self) -> dict[str, Any]:
-        """How the likeliest codes are used, and how many Gaussians have none."""
+        """Use of the likeliest codes, and number of Gaussians without a code."""
         first = torch.cat([codes[:, 0] for codes in self.codes.chunk(self.num_levels, 1)]).cpu().numpy()
         used = code_usage([first], self.codebook.num_codes).facts()
         return {**used, "unseen": self.unseen} | ({"levels": self.num_levels} if self.num_levels > 1 else {})

@@ -49,12 +49,14 @@ class LanguageField(Protocol):
         """
 
     def sums(self, places: Tensor, shares: Tensor, count: int) -> NDArray[np.float64]:
-        """Weighted sums of the distributions at each of some places ``[count, K]``; ``[N, K]`` is never held.
+        """Weighted sums ``[count, K]`` of the distributions, one for each group of Gaussians.
+
+        ``[N, K]`` is never held.
 
         Args:
-            places: Where each Gaussian counts ``[N]`` int64, in 0..count-1.
+            places: Group of each Gaussian ``[N]`` int64, in 0..count-1.
             shares: Its weight ``[N]``.
-            count: Number of places.
+            count: Number of groups.
         """
 
     def likeliest_codes(self) -> tuple[Tensor, Tensor]:
@@ -70,7 +72,7 @@ class LanguageField(Protocol):
         """The language of the Gaussians given by a mask ``[N]`` or an index ``[M]``, as `Gaussians.select`."""
 
     def facts(self) -> dict[str, Any]:
-        """What the record of a build has about it: how its codes are used."""
+        """Facts stored in the build record: how its codes are used."""
 
     def content(self) -> tuple[Tensor, ...]:
         """The tensors on which `scores` depends, for hashes."""

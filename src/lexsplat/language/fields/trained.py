@@ -121,7 +121,7 @@ class TrainedField(nn.Module):
 
     @torch.no_grad()
     def code_probabilities(self) -> Tensor:
-        """softmax(D_MLP(s_G)): what each Gaussian would show alone ``[N, K]``."""
+        """softmax(D_MLP(s_G)): the distribution of each Gaussian by itself ``[N, K]``."""
         return self._probabilities(self.semantics)
 
     @torch.no_grad()
@@ -154,7 +154,7 @@ class TrainedField(nn.Module):
 
     @torch.no_grad()
     def render_code_probabilities(self, gaussians: Gaussians, camera: Camera) -> Tensor:
-        """Eq. 8 ``[H, W, K]``. Every pixel sums to 1, also where no Gaussian is drawn (there s is 0)."""
+        """Eq. 8 ``[H, W, K]``. Every pixel sums to 1, even where no Gaussian is drawn (there s is 0)."""
         semantics, _ = self.render_semantics(gaussians, camera)
         return self._probabilities(semantics.flatten(0, 1)).unflatten(0, semantics.shape[:2])
 
@@ -174,7 +174,7 @@ class TrainedField(nn.Module):
         return TrainedField.from_tensors(tensors | rows, self.metadata())
 
     def facts(self) -> dict[str, Any]:
-        """None: the record of the stage "codebook" has how its codes are used."""
+        """None: the record of the stage "codebook" holds the use of its codes."""
         return {}
 
     def content(self) -> tuple[Tensor, ...]:

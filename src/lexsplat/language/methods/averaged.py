@@ -102,7 +102,7 @@ class Averaged:
     }
 
     def uses_dino(self, config: Any) -> bool:
-        """If asked for, and in resolved settings for class tokens."""
+        """Whether it is requested, or resolved to be used with class tokens."""
         return bool(config.averaged.dino)
 
     def fit(self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> CodeField:

@@ -97,7 +97,7 @@ def all_valid(name: str, size: tuple[int, int]) -> None:
     """The `Valid` of views without masks."""
 
 
-# Beside its inputs: masks, and three options of the run that tests leave out.
+# In addition to its inputs: masks, and three options of the run that tests leave out.
 def average_features(
     gaussians: Gaussians,
     cameras: Mapping[str, Camera],
@@ -173,7 +173,7 @@ def _is_seen(workers: Workers, folder: Path | None) -> bool:
 
 
 def sums_bound(device: torch.device, memory: int) -> int:
-    """Bytes that the sums may take: half of what is free on their GPU; on a CPU a quarter of the host memory.
+    """Bytes that the sums may take: half of the free memory of their GPU; on a CPU a quarter of the host memory.
 
     Sums of workers travel through the host, so that its bound holds for them too.
 
@@ -213,7 +213,7 @@ class _Shards(Mapping[str, _Shard]):
 
 @dataclass(frozen=True)
 class _Averaging:
-    """What the sums of every shard are made from: arguments of `average_features`."""
+    """Inputs shared by the sums of all shards: arguments of `average_features`."""
 
     gaussians: Gaussians
     cameras: Mapping[str, Camera]
@@ -224,7 +224,7 @@ class _Averaging:
 
 
 def view_shards(names: Sequence[str]) -> list[tuple[str, ...]]:
-    """The views in shards whose sums are made apart and then added in order.
+    """The views in shards, whose sums are computed separately and then added in order.
 
     The shards depend on the views alone, not on the workers, and so do the bits of the sums.
     """
@@ -255,7 +255,7 @@ def _shard_sums(shared: _Averaging, item: _Shard) -> tuple[Tensor, Tensor, int]:
 
 
 def _features(found: FeatureMap, with_dino: int) -> Tensor:
-    """What is averaged of a view ``[h, w, L (Dc + Dd)]``: CLIP and DINO features of each level."""
+    """The features of a view to average ``[h, w, L (Dc + Dd)]``: CLIP and DINO features of each level."""
     levels = found.levels or (found,)
     halves = ((level.clip, level.dino) if with_dino else (level.clip,) for level in levels)
     parts = [half for pair in halves for half in pair if half is not None]
@@ -279,7 +279,7 @@ def _cell_weights(
 
 
 def _any_nonzero(values: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which rows ``[..., C]`` have a number but 0, by their bits without the sign: NumPy is slow at halves."""
+    """Which rows ``[..., C]`` have a nonzero number, by their bits without the sign: NumPy is slow at halves."""
     bits = values.view(f"u{values.itemsize}")
     return np.asarray(np.bitwise_or.reduce(bits, axis=-1) << 1 != 0)
 

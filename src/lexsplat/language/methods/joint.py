@@ -38,7 +38,7 @@ class TrainedJointly(Trained):
     stages = (*Trained.needs, "reconstruct", "language")
 
     def geometry_inputs(self, config: Any) -> list[Any]:
-        """What the language depends on, which the same training makes."""
+        """Inputs of the language, which is trained together with the geometry."""
         return ["codebook", config.trained]
 
     def geometry_outputs(self, scratch: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""The interface of a method: what it needs, what it can leave out, and how it makes a language field."""
+"""The interface of a method: its inputs, its ablations, and how it makes a language field."""
 
 from __future__ import annotations
 
@@ -101,18 +101,18 @@ class LanguageMethod(Protocol):
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """Parts of the build settings that decide what `fit` makes, beside the seed."""
+        """Parts of the build settings that the result of `fit` depends on, in addition to the seed."""
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Stages before "language" that it needs beside the Gaussians, in order."""
+        """Stages before "language" that it needs in addition to the Gaussians, in order."""
 
     @property
     def stages(self) -> tuple[str, ...]:
         """All stages of a build, in the order in which they run."""
 
     def uses_dino(self, config: Any) -> bool:
-        """Whether DINO features take part in a build of these settings."""
+        """Whether a build of these settings uses DINO features."""
 
     @property
     def variants(self) -> Mapping[str, Variant]:
@@ -133,7 +133,7 @@ class JointMethod(LanguageMethod, Protocol):
     """A method that trains the geometry, too (``--joint``). Its `fit` takes the language that `fit_geometry` kept."""
 
     def geometry_inputs(self, config: Any) -> list[Any]:
-        """What its Gaussians depend on beside the reconstruction; the name of a stage stands for its inputs."""
+        """Inputs of its Gaussians in addition to the reconstruction's; the name of a stage stands for its inputs."""
 
     def geometry_outputs(self, scratch: Path) -> list[Path]:
         """Files in which `fit_geometry` keeps the language."""

@@ -73,7 +73,7 @@ class Trained:
         )
 
 
-# Beside its inputs: the options of a run.
+# In addition to its inputs: the options of a run.
 def train_field(
     gaussians: Gaussians,
     cameras: Mapping[str, Camera],

@@ -29,7 +29,7 @@ from lexsplat.runtime.errors import TrainingError
 
 
 class FieldTrainer:
-    """Training of the language field in single steps, alone or beside a reconstruction.
+    """Training of the language field in single steps, alone or together with a reconstruction.
 
     Args:
         gaussians: The geometry, which is not changed.

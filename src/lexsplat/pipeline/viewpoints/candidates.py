@@ -1,4 +1,4 @@
-"""Cameras among which views are chosen: around the scene and its parts, and around oneself in a room."""
+"""Candidate cameras: around the scene and its parts, and looking around inside a room."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def _free_spans(surroundings: Surroundings, level: float) -> tuple[Points, Point
 
 
 def _spread(places: Points, distances: Points, rooms: Points) -> list[Points]:
-    """Places that are far from each other: the freest one first, then always the one farthest from those taken."""
+    """Places far from each other: the freest one first, then repeatedly the one farthest from those taken."""
     chosen = [int(distances.argmax())]
     nearest = np.full(len(places), np.inf)
     while len(chosen) < _MOST_PLACES:

@@ -142,8 +142,8 @@ def choose_views(
     if len(chosen) < _FEWEST_VIEWS and unseen > _HIDDEN * visible:
         raise CaptureError(
             subject,
-            expected="views that show most of what can be seen",
-            found=f"{len(chosen)}, in which {unseen / visible:.0%} of it is hidden by floaters or haze",
+            expected="views that show most of the visible Gaussians",
+            found=f"chosen views: {len(chosen)}; floaters or haze hide {unseen / visible:.0%} of these Gaussians",
             remedy="remove the large floaters in an editor of splats, give the capture it was made from, "
             "or the up direction with --up x,y,z",
         )
@@ -191,7 +191,7 @@ def _before_photo(
 
 
 def _warn(tried: _Tried, found: Surroundings, gaussians: Gaussians, subject: Path) -> None:
-    """Warn of a kind that is uncertain, or that depends on an up direction that is a guess."""
+    """Warn if room or object is uncertain, or depends on an up direction that is a guess."""
     interior = tried.interior
     taken = (
         ("a room and looked at from inside", "around")

@@ -1,4 +1,4 @@
-"""Gaussians that float free of all surfaces: where they are many, a scene without a capture leaves them out.
+"""Gaussians that float free of all surfaces. If there are many, a scene without a capture leaves them out.
 
 Small floaters are far from everything. Large ones are as near to others as the large Gaussians of walls are. They
 differ in that surfaces are seen behind floaters, and nothing is seen behind walls. The largest engulf parts
@@ -100,7 +100,7 @@ def find_floaters(
 
 
 def isolation(gaussians: Gaussians) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How alone each Gaussian is: the mean distance of its 12 nearest solid neighbors.
+    """Isolation of each Gaussian: the mean distance of its 12 nearest solid neighbors.
 
     Returns:
         The distance in units of its median over the solid Gaussians ``[N]``, and of the Gaussian's own middle radius
@@ -184,7 +184,8 @@ def _spread(gaussians: Gaussians) -> NDArray[np.float64]:
 def _gaps(
     gaussians: Gaussians, camera: Camera, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How far the surface of a view lies behind points ``[..., 3]``, in parts of their depths, and these ``[...]``.
+    """Distance of the surface of a view behind points ``[..., 3]`` as a share of their depths, and the depths
+    ``[...]``.
 
     NaN stands for points outside of the view and for pixels that are not opaque.
     """

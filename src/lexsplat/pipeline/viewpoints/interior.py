@@ -1,7 +1,7 @@
-"""Whether splats are a room, to be looked at from inside, or an object, to be looked at from around.
+"""Whether splats are a room, viewed from inside, or an object, viewed from around.
 
-A room is closed all around its free places, and holds things. What mesh converters make of a ball or of a crate is
-closed, too, but empty: from any place inside, all that is seen is the convex shell around that place.
+A room is closed all around its free places, and holds things. A ball or crate from a mesh converter is also closed,
+but empty: from any place inside, only the convex shell around that place is seen.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _POINTS = 3000
 
 @dataclass(frozen=True)
 class Interior:
-    """What is seen from the free places within a scene.
+    """Statistics of the views from free places within a scene.
 
     Args:
         places: Number of free places.
@@ -104,7 +104,7 @@ class Interior:
 
 @dataclass(frozen=True)
 class Looks:
-    """What cameras show.
+    """Renderings of several cameras.
 
     Args:
         cameras: Cameras of `candidates.inside`: as many as `TURNS` at each free place.
@@ -118,7 +118,7 @@ class Looks:
 
     @classmethod
     def at(cls, gaussians: Gaussians, cameras: list[Camera]) -> Looks:
-        """What cameras show of Gaussians."""
+        """Render Gaussians with each camera."""
         looks = [look(gaussians, camera) for camera in cameras]
         return cls(
             cameras, [depth for depth, _ in looks], np.array([clear for _, clear in looks], np.float32)
@@ -147,7 +147,7 @@ def examine(gaussians: Gaussians, found: Surroundings, looks: Looks) -> Interior
     Args:
         gaussians: The scene.
         found: Its surroundings.
-        looks: What its free places show.
+        looks: Renderings from its free places.
     """
     result = _examined(gaussians, found, looks)
     if result.is_room or not result.hazy:

@@ -1,4 +1,4 @@
-"""What a small view of a splat shows: depth, and how much of it looks like surfaces."""
+"""Small renderings of splats: depth, and the share that looks like surfaces."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ _LEAST_WEIGHT = 0.1
 _HEIGHT = 480
 """Height in pixels of the image that is drawn."""
 _ASIDE = ((0, 0), (0.1, 0), (-0.1, 0), (0, 0.1), (0, -0.1))
-"""Places beside that of the photo, relative to the middle depth."""
+"""Places around that of the photo, relative to the middle depth."""
 _OBLIQUE = math.cos(math.radians(40))
 """Cosine of the angle at a target, between the photo and a view, beyond which holes behind things are seen."""
 

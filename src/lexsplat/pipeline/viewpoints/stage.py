@@ -1,4 +1,4 @@
-"""The capture of a build that was given splats only: its views are chosen, rendered and kept in the scene folder."""
+"""The capture of a build from splats alone: its views are chosen, rendered and kept in the scene folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What things of a scene without cameras stand on: the sides of the scene that they touch."""
+"""The supports of things in a scene without cameras: the sides of the scene that they touch."""
 
 from __future__ import annotations
 

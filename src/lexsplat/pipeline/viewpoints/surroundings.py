@@ -1,4 +1,4 @@
-"""What is known of Gaussians without cameras: their solid points, the up direction, the ground, things to look at."""
+"""Estimates about Gaussians without cameras: solid points, the up direction, the ground, things to look at."""
 
 from __future__ import annotations
 

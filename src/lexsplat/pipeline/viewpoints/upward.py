@@ -1,4 +1,4 @@
-"""Which way is up in a scene without cameras: a ground lies there, and things stand on it."""
+"""The up direction of a scene without cameras, from its ground and the things that stand on it."""
 
 from __future__ import annotations
 

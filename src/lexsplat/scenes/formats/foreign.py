@@ -61,7 +61,7 @@ def damaged(path: Path, expected: str, found: str, remedy: str = AGAIN) -> FileF
 
 
 class Damage(ValueError):
-    """What is wrong with the content of a file, in words for its user."""
+    """The content of a file is damaged; the message is for its user."""
 
 
 def reason(error: Exception) -> str:
@@ -92,7 +92,7 @@ def parsing(path: Path, expected: str, *further: type[Exception]) -> Iterator[No
 
 @contextlib.contextmanager
 def warnings_once() -> Iterator[None]:
-    """What is read more than once in this block is warned of once."""
+    """Give each warning once in this block, even if a file is read twice."""
     token = _logged.set(set())
     try:
         yield
@@ -145,15 +145,18 @@ def _turned(quats: Tensor, path: Path) -> Tensor:
     empty = (quats.abs() < _SMALLEST_QUAT).all(1)
     if count := int(empty.sum()):
         warn(
-            "%s: %d of %d Gaussians have a rotation of four zeros, read as unturned", path, count, len(quats)
+            "%s: %d of %d Gaussians have a rotation of four zeros, read as no rotation",
+            path,
+            count,
+            len(quats),
         )
     return torch.where(empty[:, None], quats.new_tensor([1.0, 0, 0, 0]), quats)
 
 
 def _near(gaussians: Gaussians, path: Path) -> Gaussians:
-    """The Gaussians without those so far out or so large that cameras around them are beyond `MAX_COORDINATE`.
+    """Drop Gaussians so distant or large that a camera around them would exceed `MAX_COORDINATE`.
 
-    Coordinates of a map, which are millions of meters from their origin, stay.
+    Map coordinates, millions of meters from their origin, are kept.
 
     Raises:
         FileFormatError: If they are more than `MOST_DROPPED` of them.

@@ -90,7 +90,7 @@ def header_lines(file: BinaryIO, path: Path) -> list[str]:
 
 
 def _no_ply(first: bytes, path: Path) -> FileFormatError:
-    """What is wrong with a file whose first line is not that of a PLY."""
+    """The error for a file whose first line is not that of a PLY."""
     if not first:
         return damaged(path, "a PLY header", "an empty file")
     if first.startswith(b"ply\r"):
@@ -142,7 +142,7 @@ def parse_elements(lines: Sequence[str], path: Path) -> list[Element]:
 
 
 def warn_of_ignored(elements: Sequence[Element], count: int, path: Path) -> None:
-    """Warn of elements beside ``count`` Gaussians that are not read and may hold others."""
+    """Warn of elements that are not read and may hold Gaussians other than the ``count`` ones."""
     ignored = [
         f"{element.name!r:.40} of length {element.count:,}"
         for element in elements

@@ -1,4 +1,4 @@
-"""What a library keeps of a scene with segments, so that most questions are answered without opening it.
+"""Contents of a scene with segments, kept by a library to answer most questions without opening the scene.
 
 Language, places and images are kept by segment, not by Gaussian: a phrase takes or leaves whole segments
 (`lexsplat.queries.segments`), and `lexsplat.scenes.library.indexed` finds out which from what is here. Segments are
@@ -61,7 +61,7 @@ class Contents:
 
     Args:
         levels: Segment at each level of each segment ``[L, S]`` int32, the lowest level first.
-        masses: What the training views show of each segment ``[S]``.
+        masses: Visible weight of each segment in the training views ``[S]``.
         rows: First entry of each segment in the two next tensors ``[S + 1]`` int32.
         columns: Codes that occur in each segment, int16.
         shares: Their shares, float16.
@@ -152,7 +152,7 @@ class Contents:
     @torch.no_grad()
     @one_thread()
     def of(cls, scene: Scene) -> Contents | None:
-        """What is kept of a scene; None if it has no segments or is asked otherwise, such as in the paper's form.
+        """The contents of a scene; None if it has no segments or is asked otherwise, such as in the paper's form.
 
         Raises:
             ModelError: If the everyday words are new to its folder and its encoder cannot be loaded.

@@ -1,4 +1,4 @@
-"""What a library keeps of a scene, in files that no other scene shares.
+"""Entries of a library: the files that it keeps for each scene.
 
 ::
 
@@ -51,7 +51,7 @@ _GAUSSIANS = 1 << 16  # Gaussians per block, so that [N, K] is never held
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Codes:
-    """What decides whether a scene may hold a text (`lexsplat.queries.everyday`).
+    """Codes of a scene, which decide whether it may hold a text (`lexsplat.queries.everyday`).
 
     Args:
         units: Codewords of unit length ``[K, D]``, float16.
@@ -82,7 +82,7 @@ class Codes:
         return digest(bytes(tensor.contiguous().numpy().data) for tensor in self.tensors().values())
 
     def checksum(self) -> str:
-        """CRC-32 of all values, eight hex digits: it finds damage, which `content` does as well in more time."""
+        """CRC-32 of all values, eight hex digits: it detects damage faster than `content`."""
         found = 0
         for tensor in self.tensors().values():
             found = zlib.crc32(tensor.contiguous().numpy().data, found)
@@ -102,7 +102,7 @@ class Codes:
         for rows in torch.arange(len(masses), device=masses.device).split(_GAUSSIANS):
             probabilities = field.select(rows).code_probabilities().cpu()
             weights += masses[rows].cpu().double() @ probabilities.double()
-            # Also where next to nothing is visible: the bound holds for any place.
+            # Even where next to nothing is visible: the bound holds for any place.
             seen |= (probabilities > 0).any(0)
         shares = (weights / weights.sum().clamp_min(1e-12)).clamp_min(1e-9) * seen
         words = scene.embed(everyday_words()).cpu()

@@ -73,7 +73,7 @@ class Hit:
 
     @property
     def source(self) -> str:
-        """What answered: "index" or "scene"."""
+        """Source of the answer: "index" or "scene"."""
         return "index" if self.indexed else "scene"
 
     @property

@@ -1,4 +1,4 @@
-"""``library.json``: what makes a folder a library, with its own name on an index server."""
+"""``library.json``, which marks a folder as a library and holds its name on an index server."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def make_library(root: Path) -> None:
 
 
 def in_use(root: Path, holder: str) -> LibraryError:
-    """The error where another process changes a library."""
+    """The error if another process changes a library."""
     return LibraryError(
         root,
         expected="a library that no other process changes",
@@ -115,7 +115,7 @@ def listed_records(root: Path, new: bool) -> list[os.DirEntry[str]]:
             (stage if root.is_dir() else root).absolute(),
             expected="the library that was opened",
             found="no such folder: it was moved or deleted",
-            remedy="put it back, or start again with its new place",
+            remedy="restore the folder, or open the library at its new path",
         ) from error
     return sorted(found, key=lambda each: each.name[:-5])
 
@@ -141,7 +141,7 @@ def _damaged(root: Path, expected: str, found: str) -> _DamagedError:
 
 
 def _mending(root: Path, otherwise: str) -> str:
-    """What repairs a lost or damaged ``library.json`` beside entries; another remedy where there are none."""
+    """The remedy for a lost or damaged ``library.json``: repair if there are entries, else ``otherwise``."""
     repair = command("verify", root, "--repair")
     mending = f"{repair} writes it again; an index server has to be filled again"
     return mending if has_entries(root) else otherwise

@@ -97,7 +97,7 @@ class _KeptPresence(PresenceClassifier):
 
 @functools.cache
 def _one_gaussian() -> Gaussians:
-    """What stands for geometry where rules read none."""
+    """A placeholder for the geometry, which no rule reads."""
     return gaussians_from_points(np.zeros((1, 3)), np.zeros((1, 3)), sh_degree=0, opacity=0.5)
 
 
@@ -189,7 +189,7 @@ def _of_objects(contents: Contents, known: list[dict[str, Any]], common: Mapping
 
 
 def _instances(contents: Contents, taken: Array, own: Array) -> list[Array]:
-    """The instances among taken segments, the largest first, without specks and what does not convince."""
+    """The instances among taken segments, the largest first, without specks and unconvincing ones."""
     sizes, opacities = contents.counts.numpy(), contents.opacities.numpy()
     order = taken[np.argsort(contents.spacings.numpy()[taken], kind="stable")]
     half = np.searchsorted(np.cumsum(sizes[order]), sizes[order].sum() / 2)

@@ -110,7 +110,7 @@ class Library:
     # -- what it holds
 
     def names(self) -> list[str]:
-        """The names of all scenes, in order, also of those whose records cannot be read.
+        """The names of all scenes, in order, even of those whose records cannot be read.
 
         Raises:
             LibraryError: If the library was moved or deleted since it was opened.
@@ -164,7 +164,7 @@ class Library:
         return known[1]
 
     def contents(self, record: Record) -> Contents:
-        """What is kept of the segments and objects of a scene, checked when it is first read.
+        """The stored segments and objects of a scene, checked when they are first read.
 
         Raises:
             FileFormatError: If it is missing or damaged.
@@ -181,7 +181,7 @@ class Library:
 
         Args:
             record: Its record.
-            thoroughly: Read its ``scene.json`` also where size and time of the file are as they were.
+            thoroughly: Read its ``scene.json`` even if size and time of the file are unchanged.
 
         Raises:
             LexsplatError: If its folder is gone, or its ``scene.json`` is damaged or of another version.
@@ -241,7 +241,7 @@ class Library:
 
         Raises:
             ModelError: If the encoder cannot be loaded.
-            LibraryError: If it is not the one of the scenes.
+            LibraryError: If the encoder is not the one that the scenes were built with.
         """
         if not content_hash:
             return torch.cat([self._tower(clip).encode_text([text]) for text in texts])
@@ -252,7 +252,7 @@ class Library:
                 clip,
                 expected=f"the encoder of the scenes ({content_hash[:12]})",
                 found="another one",
-                remedy="put the right one there, or build the scenes again and add them again",
+                remedy="put the right encoder there, or rebuild the scenes and add them again",
             ) from error
 
     def _tower(self, clip: str) -> TextTower:
@@ -410,7 +410,7 @@ class Library:
         Args:
             phrase: What to look for; with relations as in `Scene.find`.
             limit: Number of scenes, at most.
-            confirm: Search the scenes themselves, also where the index suffices.
+            confirm: Search the scenes themselves, even where the index suffices.
 
         Raises:
             QueryError: If the phrase is empty.
@@ -421,14 +421,14 @@ class Library:
     # -- repairing it
 
     def verify(self, repair: bool = False) -> dict[str, str]:
-        """What is wrong with each scene, by name: its record, its codes, or its own folder.
+        """Check all scenes; returns the problems by name: of the record, of the codes, or of the scene's folder.
 
         Args:
             repair: Repair what can be repaired: read damaged entries and rebuilt scenes again, and bring the server
                 to the state of the library. Scenes that are gone stay.
 
         Returns:
-            What is (still) wrong; empty if nothing.
+            The problems that are left, by name; empty if none.
 
         Raises:
             LibraryError: If another process changes the library, the disk is full, or the server fails.

@@ -1,4 +1,4 @@
-"""What is wrong with a library, and how it is repaired."""
+"""Problems of a library and their repair."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def problems_of(library: Library) -> dict[str, str]:
-    """What is wrong with the entry of each scene or with its folder, by name, each with its remedy.
+    """Problems of the entry or the folder of each scene, by name, each with its remedy.
 
     Raises:
         LibraryError: If nothing else is wrong, and the server fails or holds another state of the library.
@@ -40,7 +40,7 @@ def problems_of(library: Library) -> dict[str, str]:
 
 
 def mended(library: Library) -> dict[str, str]:
-    """Repair what can be repaired; returns what is still wrong, as `problems_of`.
+    """Repair what can be repaired; returns the remaining problems, as `problems_of`.
 
     Raises:
         LibraryError: If another process changes the library, the disk is full, or the server fails.
@@ -53,7 +53,7 @@ def mended(library: Library) -> dict[str, str]:
 
 
 def orphans(library: Library) -> dict[str, str]:
-    """Scenes whose codes are there without a record, and what to do."""
+    """Scenes with codes and without a record, each with a remedy."""
     found = {}
     for name in sorted(scenes_without_record(library.stage)):
         problem = f"{library.stage / name}.json: expected the record of a scene, found files without one"
@@ -76,7 +76,7 @@ def _entries(library: Library) -> dict[str, str]:
 
 
 def _problem(library: Library, name: str) -> str:
-    """What is wrong with a scene; "" if nothing is."""
+    """The problem of a scene; "" if it has none."""
     record = library.record(name)
     if record is None and name in library.damaged and recovered_record(library.stage, name) is None:
         problem = (
@@ -97,7 +97,7 @@ def _problem(library: Library, name: str) -> str:
 
 
 def rebuilt(library: Library, record: Record) -> str:
-    """What to do about a scene that was built again."""
+    """The remedy for a scene that was built again."""
     place = library.folder(record)
     return f"{place}: rebuilt since it was added; {command('add', library.root, place)}"
 

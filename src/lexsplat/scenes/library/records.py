@@ -189,7 +189,7 @@ def removals(stage: Path) -> dict[str, Path]:
 
 
 def has_entries(root: Path) -> bool:
-    """Whether a folder holds the entry of a scene, so that it is a library also without ``library.json``."""
+    """Whether a folder holds the entry of a scene, so that it is a library even without ``library.json``."""
     stage = root / "scenes"
     return any(recovered_record(stage, scene) for _, scene in _own_files(stage)) or any(
         _is_record(path) for path in stage.glob("[!.]*.json")

@@ -166,7 +166,7 @@ class _Asking:
         self._texts: dict[str, Tensor] = {}
 
     def hit(self, name: str, bound: float) -> Hit:
-        """The answer of a scene, also if it is "no".
+        """The answer of a scene, even if it is "no".
 
         Raises:
             LexsplatError: If it cannot be asked.

@@ -1,4 +1,4 @@
-"""What a page knows of its scene before it reads a file: ``manifest.json``."""
+"""``manifest.json``, the first file that a page reads."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lexsplat.scenes.scene import Scene
 
 FORMAT, FORMAT_VERSION = "lexsplat-page", 7
 DRAWN_SPLATS = 1_000_000
-"""Gaussians that a page draws at once, at most; of more, those that cover most of the image."""
+"""Maximum number of Gaussians that a page draws at once; it chooses those that cover most of the image."""
 MOST_OBJECTS = 200
 """Entries of the list of objects, at most."""
 
@@ -103,7 +103,7 @@ def colored_entries(scene: Scene, objects: Sequence[Selection]) -> list[dict[str
 
 
 def kind_entries(objects: Sequence[Selection]) -> dict[str, list[int]]:
-    """The places of a scene's objects that each kind holds, by every text that names the kind; "" is any thing."""
+    """Indices of the objects of each kind, keyed by every name of the kind; "" is any thing."""
     found = {
         text: [place for place, each in enumerate(objects) if is_of_kind(each.phrase, text)]
         for text in KIND_PHRASES

@@ -83,7 +83,7 @@ def _is_thing(phrase: str) -> bool:
 
 
 def asked_phrases(scene: Scene) -> list[str]:
-    """What was asked of a scene in the viewer, the latest first; nothing for a scene without a folder."""
+    """Phrases asked in the viewer, the latest first; none for a scene without a folder."""
     if scene.folder is None:
         return []
     try:

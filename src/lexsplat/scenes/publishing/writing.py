@@ -73,7 +73,7 @@ class PublishOptions:
 
 @dataclass(frozen=True)
 class Published:
-    """What was written.
+    """The result of publishing.
 
     Args:
         path: The folder or the file.
