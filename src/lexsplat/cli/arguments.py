@@ -62,7 +62,7 @@ _DEFAULTS = {
     "iterations": "chosen for the device",
     "up": "from the cameras",
 }
-"""What help pages state as the default of an option that is None or empty, unless the command states another."""
+"""Defaults on help pages of options that are None or empty, unless the command states another."""
 
 _RENAMED = {
     "--averaging.": "--averaged.",
