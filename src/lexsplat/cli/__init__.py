@@ -60,7 +60,7 @@ _REMEDIES = {
     **dict.fromkeys((errno.EEXIST, errno.ENOTDIR), "; give another place"),
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "; free some space and run the same command again"),
 }
-"""What to do about errors of the system, by their numbers."""
+"""Remedies for errors of the system, by their numbers."""
 
 ALIASES = {"embed": "language"}
 """Other names of commands."""

@@ -64,7 +64,7 @@ _DEFAULTS = {
     "up": "from the cameras",
     "averaged.dino": "by the tokens of CLIP",
 }
-"""What help pages state as the default of an option that is None or empty, unless the command states another.
+"""Defaults on help pages of options that are None or empty, unless the command states another.
 
 Settings of a part have the name of the part in front.
 """

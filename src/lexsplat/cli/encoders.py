@@ -13,7 +13,7 @@ from lexsplat.features.encoders import DEFAULT_CLIP, DEFAULT_DINO
 from lexsplat.runtime.progress import Event
 
 _PHOTOS, _SIZE = 100, (1440, 1080)
-"""What the time is stated for if no capture is given."""
+"""Number and size of the photos for which the time is stated if no capture is given."""
 
 
 @dataclasses.dataclass

@@ -46,7 +46,7 @@ FileArgument = tyro.conf.Positional[
 ]
 
 PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probably not in this scene"}
-"""What is printed behind an answer, by its value of ``present``."""
+"""Text printed after an answer, by its value of ``present``."""
 
 
 def open_scene(path: str, device: str, clip: str | None) -> Scene:

@@ -42,8 +42,8 @@ class ComparisonPlan:
 def compare(bench: Bench, plan: ComparisonPlan | None = None) -> list[dict[str, Any]]:
     """Measure the methods; writes ``comparison.json``, ``.csv``, ``.tex`` and ``.html`` (`Bench.measure`).
 
-    Memory is the peak of the process while a method's language is made (Linux only); storage is what a scene must
-    keep to answer; training time is reconstruction, features and language.
+    Memory is the peak of the process while a method's language is made (Linux only). Storage is the size of the data
+    needed to answer. Training time is reconstruction, features and language.
 
     Args:
         bench: Where they are made and measured.

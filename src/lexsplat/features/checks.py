@@ -20,7 +20,7 @@ WORDS = (
     "red apple", "blue mug", "gold ring", "brown teddy bear", "green bottle", "rubber duck", "stack of books",
     "traffic cone", "potted plant", "table lamp", "banana", "pumpkin",
 )  # fmt: skip
-"""What the images show."""
+"""Content of the images."""
 
 ENOUGH = 0.75
 """Least share of the other words that rank below the right one; 0.5 is chance."""

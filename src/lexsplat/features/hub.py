@@ -45,7 +45,7 @@ _VOCABULARIES = (
 )  # fmt: skip
 _TOKENIZER_SETTINGS = ("tokenizer_config.json", "special_tokens_map.json", "added_tokens.json")
 _OTHERS = {"segments": "superpixels, which need no model (`--features.segments slic`)"}
-"""What is there in place of a model that has no bundled one."""
+"""Alternative for a role without a bundled model."""
 _HUB_TIMEOUT = 5.0  # seconds to wait for the hub's first response; without a network it fails at once
 
 KEPT_FROM = 1 << 26

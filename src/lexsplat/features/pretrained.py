@@ -46,7 +46,7 @@ class PretrainedModel:
     """
 
     tower: ClassVar[str]
-    """What the model is used as: "clip", "dino" or "segments"."""
+    """Role of the model: "clip", "dino" or "segments"."""
     _spare: ClassVar[str] = r"(position_ids|logit_scale|logit_bias)$"
     """Pattern of tensors that are not used, so that they may be missing."""
 

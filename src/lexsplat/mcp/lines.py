@@ -38,7 +38,7 @@ async def messages(received: Any, sent: Any) -> AsyncIterator[SessionMessage]:
 
 
 def _mended(error: Exception) -> Any:
-    """The message that an unreadable line stands for; else an answer to the line; None for an empty one."""
+    """The message that an unreadable line stands for, or else an answer to the line. None for an empty line."""
     line = error.errors()[0]["input"] if isinstance(error, ValidationError) else None
     identity = None
     try:

@@ -33,7 +33,7 @@ _TOLD_FROM = 12
 
 
 BUNDLED_SCENES = Path(__file__).resolve().parents[1] / "demo"
-"""What the bundled encoders know."""
+"""Folder of the captures and scenes that the bundled encoders know."""
 
 
 class Encoders:

@@ -26,7 +26,7 @@ _STEPS = 5
 _FOOT = 0.3
 """Share of a thing's height that is its foot, or its top."""
 _AROUND = 2.5
-"""What is within this many radii of the foot is near it."""
+"""Distance from the foot, in radii, up to which points are near it."""
 _FEW = 30
 """With fewer points near the foot, the surface is hidden there (by a cloth), and all of it counts."""
 _BEYOND = 0.04

@@ -85,7 +85,7 @@ _FIXED = re.compile(
 )
 """Function words of fixed noun phrases."""
 _DESCRIBES = re.compile(r"something (?:to|that|which|who|made|with)\b|.*\S to (?=\w)", re.IGNORECASE)
-"""What has words of a verb phrase after it."""
+"""Words that are followed by a verb phrase."""
 _ARTICLE = re.compile(
     r"\b(?!(?:with|of|for|without|like|from|\w+ing)\b)\w+ (?:the|a|an|my|your)\b(?= \w)|^(?:order|size)\b",
     re.IGNORECASE,

@@ -42,7 +42,7 @@ CONVINCING = 0.65
 log-odds. On the second demo scene, 3 of the 4 wrong or partial instances of 20 prompts reach 0.47 to 0.50, and one
 reaches 0.32; the right ones reach 1."""
 _PLACE = ("indices", "num_gaussians", "box", "sample", "tree", "view_shares", "best_view")
-"""What follows from the Gaussians of a selection alone."""
+"""Attributes that depend only on the Gaussians of a selection."""
 _SAMPLE = 4000
 PEAK_COUNT = 20
 FAINT = 0.1

@@ -12,7 +12,7 @@ _SAME_FORM = {"glass", "cloth", "cutlery", "stairs", "people", "scissors", "trou
 _NOT_BY_LEMMA = {"leaves": "leaf", "shelves": "shelf", "lenses": "lens"}
 """Plurals that simplemma takes for verbs, or has under a rare spelling."""
 _SPELLINGS = 4
-"""What a phrase with several typing errors may mean, at most."""
+"""Maximum number of corrections of a phrase with several typing errors."""
 _ALIKE = 0.74
 """Smallest similarity of a word and its typing error (`difflib`): two letters of four changed places."""
 

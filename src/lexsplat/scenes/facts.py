@@ -12,7 +12,7 @@ NO_SEGMENTS = (
     "single Gaussians answer; lexsplat language CAPTURE --output SCENE, with the options of the build, adds segments"
     " (method averaged)"
 )
-"""What it means that a scene has no segments, and how to get them."""
+"""A note on a scene without segments: the consequence, and how to add them."""
 
 
 def is_of_chosen_views(record: Mapping[str, Any]) -> bool:

@@ -99,9 +99,9 @@ def find_upward(points: Points, look: Callable[[Points], float]) -> UpwardDirect
 def up_candidates(pieces: Pieces) -> list[tuple[Points, float]]:
     """Directions that may be up, with scores.
 
-    They are the normals of the largest planes, either way, and the directions of the usual conventions. A direction
-    scores by the area of surfaces across it in the lower third of the scene, less that in the upper third; by what
-    stands above them; by how low the points lie; and a little by convention.
+    They are the normals of the largest planes, either way, and the directions of the usual conventions. The score of
+    a direction has four terms: the area of surfaces across it in the lower third of the scene, less that in the upper
+    third; the things above these surfaces; how low the points lie; and a small bonus by convention.
 
     Args:
         pieces: Surfaces of the middle of the scene.

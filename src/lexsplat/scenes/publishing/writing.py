@@ -46,7 +46,7 @@ MOST_SPLATS = 4_000_000
 SINGLE_FILE_BYTES = 50_000_000
 """Largest size of the files that go into one HTML file."""
 _STAGE, _STEPS = "page", 6
-"""What progress events are of: Gaussians, their codes, objects, phrases, text tower, manifest."""
+"""The steps that progress events count: Gaussians, their codes, objects, phrases, text tower, manifest."""
 _PLAIN_NAME = re.compile(r"\w+(\.\w+)*")
 
 
