@@ -5,7 +5,7 @@ A command class may have these attributes in addition to its fields:
 - ``essential``: names of the settings of a build that ``--help`` shows; ``--help-all`` shows the others, too;
 - ``rare``: names of the command's own options that only ``--help-all`` shows;
 - ``unused``: names of the settings that the command accepts and ignores, which no help page shows;
-- ``defaults``: defaults of options that are None or empty, in words, in addition to the usual ones;
+- ``defaults``: words for the defaults of options that are None or empty, where `_DEFAULTS` does not suit;
 - ``synonyms``: other spellings of options;
 - ``elsewhere``: options of another command, with the command that has them.
 
@@ -64,7 +64,7 @@ _DEFAULTS = {
     "up": "from the cameras",
     "averaged.dino": "by the tokens of CLIP",
 }
-"""Defaults on help pages of options that are None or empty, unless the command states another.
+"""Words on help pages for defaults that are None or empty. Those of the command come first.
 
 Settings of a part have the name of the part in front.
 """

@@ -15,6 +15,7 @@ from lexsplat.evaluation.protocols import PROTOCOLS
 from lexsplat.evaluation.report.gallery import Gallery
 from lexsplat.evaluation.report.page import write_report
 from lexsplat.evaluation.report.tables import table_rows, write_rows
+from lexsplat.evaluation.results import Metrics
 from lexsplat.pipeline.inputs import reload_capture
 from lexsplat.runtime.environment import machine_facts
 from lexsplat.runtime.errors import CaptureError
@@ -100,17 +101,22 @@ def evaluate_scene(
     for done, view in enumerate(gallery.views):
         listener(Event("report", done, len(gallery.views)))
         gallery.add_features(view, feature_picture(scene, view, colors).cpu().numpy())
+    _write_results(folder.root, metrics, gallery, title)
+    listener(Event("report", len(gallery.views), len(gallery.views)))
+    return metrics.to_json()
+
+
+def _write_results(root: Path, metrics: Metrics, gallery: Gallery, title: str) -> None:
+    """Numbers, report and heatmaps of a scene in its folder."""
     result = metrics.to_json()
-    write_json(folder.root / "metrics.json", result)
-    write_rows(folder.root, "metrics", table_rows({title: result}))
-    write_report(folder.root / "report.html", metrics, gallery, title=title)
+    write_json(root / "metrics.json", result)
+    write_rows(root, "metrics", table_rows({title: result}))
+    write_report(root / "report.html", metrics, gallery, title=title)
     for (view, prompt), images in gallery.cases.items():
         stem = Path(view).with_suffix("")
-        path = folder.root / "heatmaps" / file_name(prompt) / stem.with_name(stem.name + ".jpg")
+        path = root / "heatmaps" / file_name(prompt) / stem.with_name(stem.name + ".jpg")
         with atomic_path(path) as temporary:
             temporary.write_bytes(images["heatmap"])
-    listener(Event("report", len(gallery.views), len(gallery.views)))
-    return result
 
 
 def _prompt_kinds(root: Path) -> dict[str, str]:

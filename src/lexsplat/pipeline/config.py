@@ -186,7 +186,7 @@ class BuildConfig:
         """Refuse settings of the reconstruction if Gaussians are given.
 
         Raises:
-            ValueError: If they do.
+            ValueError: If there is such a setting.
         """
         if self.joint:
             raise ValueError("joint training makes its own Gaussians: leave --splats out, or --joint")

@@ -8,8 +8,9 @@ parts score alike, and its handle alone where only the handle scores high. As lo
 than the rest, such as the whole mug for "mug handle".
 
 The result is a score in 0..1 for each Gaussian. It is at least 0.5 exactly for Gaussians of taken segments, so the
-threshold of masks and of selections is 0.5 for every prompt. On both sides a Gaussian's own relevancy decides. It
-counts less where the views disagree (u_G), since crops of what lies beside a thing show the thing, too.
+threshold of masks and of selections is 0.5 for every prompt. On both sides of it the score rises with the Gaussian's
+own relevancy, weighted by how far its views agree (1 - u_G). Next to a thing the views disagree, because only some of
+the crops show the thing.
 
 Dimension letters: P prompts, N Gaussians, L levels, S segments.
 """

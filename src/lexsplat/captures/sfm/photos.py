@@ -178,12 +178,7 @@ def poses_from_photos(
         best = _best_attempt(database, photos, config, seed, memory, listener, report_pairs)
         if best is None:
             _discard(work, output)
-            raise CaptureError(
-                folder,
-                expected="photos that overlap",
-                found=f"{len(names)} photos, none of which could be registered",
-                remedy="take more photos with 60 to 80 percent overlap, moving the camera between them",
-            )
+            raise _none_registered(folder, len(names))
         unregistered = mapping.unregistered(names, best)
         mapping.write_model(best.model, output)
     _discard(work, output)
@@ -200,6 +195,15 @@ def poses_from_photos(
         best.mapper,
         best.all_pairs,
         photos.notes,
+    )
+
+
+def _none_registered(folder: Path, photos: int) -> CaptureError:
+    return CaptureError(
+        folder,
+        expected="photos that overlap",
+        found=f"{photos} photos, none of which could be registered",
+        remedy="take more photos with 60 to 80 percent overlap, moving the camera between them",
     )
 
 
