@@ -1,12 +1,12 @@
 """Reconstruction quality (PSNR, SSIM, Gaussians, processor seconds) of settings, over captures and seeds.
 
     python benchmarks/reconstruction.py second demo ../data/bonsai=4 --variants default mcmc --seeds 0 1 --json FILE
-    python benchmarks/reconstruction.py demo=3 --photos 12 --variants default known-points --iterations 1500
+    python benchmarks/reconstruction.py demo=3 --photos 12 --variants default --points 0 2500 --iterations 1500
 
 A capture is a folder, ``demo`` or ``second``, optionally with ``=DOWNSCALE``. Settings are measured on **validation
 views**: every sixth *training* view is held out and the test views are not used, so a default may be chosen by this
 table. ``--on test`` measures a chosen default on the test views. All variants start from the same points, which are
-computed once. "known-points" trains few photos without the points that are added between those.
+computed once. ``--points`` varies how many points few photos are filled up to; 0 adds none.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import argparse
 import dataclasses
 import time
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from lexsplat.evaluation.demo import demo_capture
 from lexsplat.evaluation.metrics import psnr, ssim
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor
-from lexsplat.reconstruction.few_photos import has_few_photos, points_between
+from lexsplat.reconstruction.few_photos import ENOUGH_POINTS, has_few_photos, points_between
 from lexsplat.rendering import render
 
 VALIDATION_EVERY = 6
@@ -44,7 +45,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "regularized": {"opacity_weight": 0.01, "scale_weight": 0.01},
     "degree-1": {"sh_degree": 1},
     "exposure": {"exposure": True},
-    "known-points": {},
 }
 """Variants by name, and the fields of `ReconstructionConfig` that they change."""
 
@@ -57,28 +57,27 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, help="optimization steps; default: 2,000, on CUDA 30,000")
     parser.add_argument("--on", choices=("validation", "test"), default="validation")
     parser.add_argument("--photos", type=int, help="training photos, evenly spaced; default: all")
+    parser.add_argument("--points", type=int, nargs="+", default=[ENOUGH_POINTS], metavar="N")
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     rows = []
-    print(f"{'capture':12} {'variant':12} seed   PSNR   SSIM  Gaussians  seconds")
+    print(f"{'capture':14} {'variant':12}  points seed   PSNR   SSIM  Gaussians  seconds")
     for wish in options.captures:
         name, _, downscale = wish.partition("=")
         scene, config = prepared(name, float(downscale) if downscale else None, options)
         with ProgressBars() as bars:
             known = initial_points(scene, seed=0, listener=bars)
-        between = points_between(scene, known) if has_few_photos(scene) else known
-        for variant in options.variants:
-            points = known if variant == "known-points" else between
-            for seed in options.seeds:
-                changed = dataclasses.replace(config, **VARIANTS[variant])
-                row = {"capture": Path(name).name, "variant": variant, "seed": seed}
-                row |= measured(scene, changed, points, seed, options.device)
-                rows.append(row)
-                print(
-                    f"{row['capture']:12} {variant:12} {seed:4} {row['psnr']:6.2f} {row['ssim']:6.3f}"
-                    f" {row['gaussians']:10,} {row['seconds']:8.1f}",
-                    flush=True,
-                )
+        for variant, enough, seed in product(options.variants, options.points, options.seeds):
+            points = points_between(scene, known, enough=enough) if has_few_photos(scene) else known
+            changed = dataclasses.replace(config, **VARIANTS[variant])
+            row = {"capture": Path(name).name, "variant": variant, "points": len(points.points), "seed": seed}
+            row |= measured(scene, changed, points, seed, options.device)
+            rows.append(row)
+            print(
+                f"{row['capture']:14} {variant:12} {row['points']:7,} {seed:4} {row['psnr']:6.2f} {row['ssim']:6.3f}"
+                f" {row['gaussians']:10,} {row['seconds']:8.1f}",
+                flush=True,
+            )
     write_record(options.json, rows, on=options.on, device=options.device)
 
 

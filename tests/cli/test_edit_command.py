@@ -102,7 +102,7 @@ def test_steps_are_applied_within_a_stage_of_progress(built, tmp_path, monkeypat
     monkeypatch.setattr(LateProgress, "__call__", listen)
     original = editing.apply
     monkeypatch.setattr(editing, "apply", apply)
-    move = ("move", "--select", "blue ball", "--threshold", "0.05", "--by", "0", "0", "1")
+    move = ("move", "--select", "blue ball", "--threshold", "0.05", "--by", "0", "0", "1", "--no-fill")
     for words in (move, move, ("undo",), ("redo",)):
         assert cli.main(["edit", str(copy), *words]) == 0
     assert len(applied) == 1 + 2 + 3 + 2, "each command replays the steps so far"

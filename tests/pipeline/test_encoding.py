@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+import torch
 
 from lexsplat.captures import load_capture
 from lexsplat.features import FeatureConfig
@@ -45,6 +46,32 @@ def test_only_encoders_that_take_part_are_looked_for(changes, missing):
         return
     with pytest.raises(ModelError, match="absent"):
         check_encoders(config)
+
+
+def test_encoders_may_be_on_a_gpu_beside_a_rasterizer_on_the_cpu(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    loaded = []
+    for kind in ("clip", "dino"):
+        monkeypatch.setattr(f"lexsplat.features.encoders.load_{kind}", lambda *given: loaded.append(given[1]))
+    config = BuildConfig(clip="a", dino="b", device="cpu", encoder_device="cuda", method="trained")
+    config = config.resolved("cpu", (96, 72))
+    encoders = Encoders.of(config)
+    assert (encoders.clip, encoders.dino) == (None, None)
+    assert loaded == ["cuda", "cuda"]
+    assert config.features.tokens == BuildConfig(clip="a", dino="b").resolved("cuda", (96, 72)).features.tokens
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_features_of_encoders_on_a_gpu_are_those_of_the_cpu(tiny_capture, tmp_path):
+    capture, maps = load_capture(tiny_capture), {}
+    small = FeatureConfig(crop_sizes=(0.5,), crop_strides=(0.5,), map_cells=8, max_short_side=24)
+    for device in ("cpu", "cuda"):
+        config = BuildConfig(encoder_device=device, clip="bundled", dino="bundled", features=small)
+        config = config.resolved("cpu", (96, 72))
+        maps[device] = feature_maps(capture, config, Encoders.of(config), tmp_path / device)
+    for name, expected in maps["cpu"].items():
+        assert (expected.clip * maps["cuda"][name].clip).sum(-1).min() > 0.999
 
 
 def test_the_time_of_the_features_is_told_once_if_no_check_has_told_it(

@@ -65,9 +65,9 @@ def test_no_point_is_added_under_a_mask(capture, points, monkeypatch):
     assert columns.min() > half - 1e-3
 
 
-def test_no_point_is_added_where_there_are_enough(capture, points, monkeypatch):
-    monkeypatch.setattr(few_photos, "ENOUGH_POINTS", len(points.points))
-    np.testing.assert_array_equal(points_between(capture, points).points, points.points)
+def test_no_point_is_added_where_there_are_enough(capture, points):
+    enough = len(points.points)
+    np.testing.assert_array_equal(points_between(capture, points, enough=enough).points, points.points)
 
 
 def test_many_photos_start_from_the_known_points_alone(capture, monkeypatch, caplog):

@@ -15,7 +15,7 @@ from lexsplat.language.fields import CodeField
 from lexsplat.queries.selection import Selection
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.editing import Editor
+from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.filling import Fill, fill_for
 from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.scene import Scene
@@ -70,6 +70,39 @@ def test_a_deleted_thing_leaves_a_closed_surface_with_the_colors_around(turned):
     assert np.abs(colors[places[:, 0] < -0.15] - LEFT).max() < 0.15
     assert np.abs(colors[places[:, 0] > 0.15] - RIGHT).max() < 0.15
     assert not editor.scene.field.codes.any(), "the language of the table"
+
+
+def test_a_moved_thing_leaves_the_surface_that_a_deleted_one_leaves(tmp_path):
+    scene, _ = checkered_table_with_a_box(shadow=False)
+    chosen = box_of(scene)
+    deleted, moved, kept = Editor(scene), Editor(scene, tmp_path / "edits.jsonl"), Editor(scene)
+    deleted.delete(chosen)
+    away = Motion(translation=(1.0, 0.5, 0.2))
+    moved.move(chosen, away)
+    there = moved.scene.gaussians.means[moved.scene.field.codes[:, 0] == 1]
+    expected = scene.gaussians.means[chosen.mask] + torch.tensor(away.translation)
+    torch.testing.assert_close(there, expected)
+    rest = moved.scene.gaussians.select(moved.scene.field.codes[:, 0] == 0)
+    assert torch.equal(rest.means, deleted.scene.gaussians.means)
+    assert len(rest) != int((~chosen.mask).sum()), "remains under the box are gone, and the hole is filled"
+    again = Editor(scene, tmp_path / "edits.jsonl")
+    assert torch.equal(again.scene.gaussians.means, moved.scene.gaussians.means)
+    assert moved.undo()
+    assert torch.equal(moved.scene.gaussians.means, scene.gaussians.means)
+    kept.move(chosen, away, fill=False)
+    assert len(kept.scene.gaussians) == len(scene.gaussians)
+
+
+@pytest.mark.parametrize("broken", ["####", None, 5, ""])
+def test_damaged_remains_of_a_moved_thing_are_reported_in_one_line(tmp_path, broken):
+    scene, world = table_with_a_ball()
+    journal = tmp_path / "edits.jsonl"
+    Editor(scene, journal).move(ball_of(scene, world), Motion(translation=(1.0, 0, 0)))
+    header, line = journal.read_text().splitlines()
+    journal.write_text(f"{header}\n{json.dumps({**json.loads(line), 'remains': broken})}\n")
+    with pytest.raises(FileFormatError) as error:
+        Editor(scene, journal)
+    assert "\n" not in str(error.value)
 
 
 def test_nothing_is_filled_where_a_thing_stands_on_nothing_or_a_fill_is_not_wanted():
@@ -176,13 +209,17 @@ def solid(points, colors, last):
     return Scene(gaussians, field, views, "bundled")
 
 
+def box_of(scene):
+    mask = scene.field.codes[:, 0] == 1
+    world = World(Up(np.array([0, 0, 1.0]), True))
+    return Selection(scene.gaussians, scene.cameras, mask, mask.float(), world=world)
+
+
 @pytest.mark.parametrize("shadow", [False, True])
 def test_checkers_go_on_where_a_box_stood_and_nothing_of_its_color_stays(shadow):
     scene, alone = checkered_table_with_a_box(shadow)
-    mask = scene.field.codes[:, 0] == 1
-    chosen = Selection(
-        scene.gaussians, scene.cameras, mask, mask.float(), world=World(Up(np.array([0, 0, 1.0]), True))
-    )
+    chosen = box_of(scene)
+    mask = chosen.mask
     editors = {fill: Editor(scene) for fill in (True, False)}
     for fill, editor in editors.items():
         editor.delete(chosen, fill=fill)

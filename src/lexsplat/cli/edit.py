@@ -27,7 +27,7 @@ _MOTION = ("by", "turn", "scale")
 _OPTIONS = {
     "delete": ("fill",),
     "recolor": ("color", "strength"),
-    "move": _MOTION,
+    "move": (*_MOTION, "fill"),
     "duplicate": _MOTION,
     "save": ("output",),
     "discard": ("yes",),
@@ -70,7 +70,8 @@ class Edit:
         grow: Widen the selection by this distance in units of the scene.
         shrink: Narrow the selection by this distance in units of the scene.
         largest: Change only the largest of the things found.
-        fill: Close the surface under a deleted thing, which no photo shows: the pattern around it goes on.
+        fill: Close the surface under a thing that is deleted or moved, which no photo shows: the pattern around it
+            goes on.
         color: New color for recolor: three numbers in 0..1, "#ff8800" or a name such as orange.
         strength: Share of the new color, in 0..1.
         by: Shift in units of the scene, for move and duplicate.
@@ -188,8 +189,11 @@ class Edit:
                 if self.action == "recolor" and self.color:
                     editor.recolor(chosen, self.color, self.strength)
                 elif self.action in ("move", "duplicate"):
-                    turn = rotation_about(chosen.up.direction, self.turn)
-                    getattr(editor, self.action)(chosen, Motion(self.by, turn, self.scale))
+                    motion = Motion(self.by, rotation_about(chosen.up.direction, self.turn), self.scale)
+                    if self.action == "move":
+                        editor.move(chosen, motion, self.fill)
+                    else:
+                        editor.duplicate(chosen, motion)
                 elif self.action == "delete":
                     editor.delete(chosen, self.fill)
                 else:

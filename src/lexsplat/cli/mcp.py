@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import importlib.util
 import os
@@ -97,16 +96,19 @@ class Mcp:
         server = make_server(scenes, self.output.resolve() if self.allow_write else None, library)
         for served in scenes.values():  # meanwhile the client connects; the process ends after them
             threading.Thread(target=served.warm).start()
-        if listening is not None:
+        # An exception might be raised within an import of the thread above, which would never end then; and nothing
+        # else ends the thread that waits for the client's next line.
+        before = signal.signal(signal.SIGINT, lambda *_: os._exit(0))
+        try:
+            if listening is None:
+                server.run()
+                return
             host = f"[{self.host}]" if ":" in self.host else self.host
             address = f"http://{host}:{listening.getsockname()[1]}/mcp"
-            with contextlib.suppress(KeyboardInterrupt):  # the way to end a server, as of lexsplat view
-                print(f"{', '.join(self.scenes)} served at {address} (Ctrl-C stops the server)", flush=True)
-                serve_http(server, listening, self.host, self.token)
-            return
-        # Nothing else ends the thread that waits for the client's next line.
-        signal.signal(signal.SIGINT, lambda *_: os._exit(0))
-        server.run()
+            print(f"{', '.join(self.scenes)} served at {address} (Ctrl-C stops the server)", flush=True)
+            serve_http(server, listening, self.host, self.token)
+        finally:
+            signal.signal(signal.SIGINT, before)
 
     def _open(self) -> tuple[dict[str, OpenScene], Library | None]:
         """The scenes by name, and the library; both show progress on standard error, never on standard output."""

@@ -28,7 +28,7 @@ from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.filling import Fill, fill_for, hidden_inside
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
-from lexsplat.scenes.journal import Journal, Kind, Step
+from lexsplat.scenes.journal import Journal, Kind, Step, packed, unpacked
 from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.transforms import transformed
@@ -70,7 +70,11 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
     for name, tensor in gaussians.tensors().items():
         tensors[name] = tensor.clone()
         tensors[name][mask] = getattr(changed, name)
-    return replace(gaussians, **tensors), language
+    changed = replace(gaussians, **tensors)
+    if "fill" not in step.values:
+        return changed, language
+    remains = unpacked(step.values["remains"], len(gaussians)).to(mask.device)
+    return _filled(changed, language, ~remains, Fill.from_json(step.values["fill"]))
 
 
 def _filled(
@@ -185,7 +189,7 @@ class Editor:
             chosen: The selection.
             fill: Close the surface under its things, which no photo shows (`lexsplat.scenes.filling`).
         """
-        self._do("delete", chosen, **({"fill": None} if fill else {}))
+        self._do("delete", chosen, fill)
 
     def keep(self, chosen: Selection) -> None:
         """Remove everything but a selection."""
@@ -195,13 +199,18 @@ class Editor:
         """Give a selection another color, RGB in 0..1, with its old shading (`recolored`)."""
         self._do("recolor", chosen, color=[float(c) for c in color], strength=float(strength))
 
-    def move(self, chosen: Selection, motion: Motion) -> None:
+    def move(self, chosen: Selection, motion: Motion, fill: bool = True) -> None:
         """Translate, rotate and scale a selection.
+
+        Args:
+            chosen: The selection.
+            motion: The transform.
+            fill: Close the surface under its things at their old places, as `delete` does.
 
         Raises:
             ValueError: If the motion is invalid (see `lexsplat.scenes.transforms.transformed`).
         """
-        self._do("move", chosen, **motion.values(chosen))
+        self._do("move", chosen, fill, **motion.values(chosen))
 
     def duplicate(self, chosen: Selection, motion: Motion) -> None:
         """Add a copy of a selection, transformed as by `move`.
@@ -271,7 +280,7 @@ class Editor:
 
         A deletion with a fill also takes remains under the thing that no view shows (`lexsplat.scenes.filling`).
         """
-        return self._whole(chosen, fill=kind == "delete").mask
+        return self._whole(chosen, fill=kind in ("delete", "move")).mask
 
     def _whole(self, chosen: Selection, fill: bool) -> Selection:
         """A selection extended to whole things; with ``fill``, also by the hidden Gaussians inside them."""
@@ -280,7 +289,7 @@ class Editor:
             return whole
         return replace(whole, mask=whole.mask | hidden_inside(whole, self.scene.hidden))
 
-    def _do(self, kind: Kind, chosen: Selection, **values: Any) -> None:
+    def _do(self, kind: Kind, chosen: Selection, fill: bool = False, **values: Any) -> None:
         if len(chosen.mask) != len(self.scene.gaussians):
             raise ValueError("the selection was made before the last edit: select again")
         if not chosen:
@@ -290,12 +299,18 @@ class Editor:
                 found="nothing",
                 remedy="try other words or a lower threshold",
             )
-        whole = self._whole(chosen, "fill" in values)
-        if "fill" in values:
+        whole = self._whole(chosen, fill)
+        mask = whole.mask
+        if fill:
             cameras = [view.camera for view in self.original.views.values() if view.split == "train"]
-            fill, mask = fill_for(whole, cameras, self.original.listener)
-            values, whole = {} if fill is None else {"fill": fill.to_json()}, replace(whole, mask=mask)
-        step = Step(kind, whole.mask.clone().cpu(), values, chosen.phrase)
+            found, gone = fill_for(whole, cameras, self.original.listener)
+            if found is not None:
+                values["fill"] = found.to_json()
+            if kind == "delete":
+                mask = gone
+            elif found is not None:
+                values["remains"] = packed(gone & ~mask)
+        step = Step(kind, mask.clone().cpu(), values, chosen.phrase)
         with self._change(step.to_json()):
             self._advance(step)
             self.undone.clear()

@@ -35,7 +35,8 @@ class Step:
         kind: The operation.
         mask: The Gaussians it applies to ``[N]`` bool, of those that exist before the step.
         values: Its numbers: "color" and "strength", or "rotation" ``[3, 3]``, "scale", "translation", "center"; or
-            "fill", the Gaussians that close the hole (`lexsplat.scenes.filling.Fill.to_json`).
+            "fill", the Gaussians that close the hole (`lexsplat.scenes.filling.Fill.to_json`), and "remains", those
+            that are deleted where a thing is moved away (`packed`).
         phrase: What was asked for, for display.
     """
 
@@ -51,12 +52,11 @@ class Step:
 
     def to_json(self) -> dict[str, Any]:
         """Plain data; the mask as compressed bits."""
-        bits = zlib.compress(np.packbits(self.mask.cpu().numpy()).tobytes(), 6)
         return {
             "step": self.kind,
             "phrase": self.phrase,
             "gaussians": len(self.mask),
-            "mask": base64.b64encode(bits).decode("ascii"),
+            "mask": packed(self.mask),
             **self.values,
         }
 
@@ -68,21 +68,40 @@ class Step:
             ValueError: If the data are not a step.
         """
         try:
-            count, kind = data["gaussians"], _RENAMED_KINDS.get(data["step"], data["step"])
-            raw = base64.b64decode(data["mask"])
-            if type(count) is not int or not 0 <= count <= 8 * _DEFLATE * max(len(raw), 1):
-                raise ValueError(
-                    f"not a step: {len(raw)} bytes cannot hold a mask of {count!r} Gaussians"[:100]
-                )
-            packed = zlib.decompressobj().decompress(raw, count // 8 + 1)
-            bits = np.unpackbits(np.frombuffer(packed, np.uint8))[:count]
-        except (KeyError, TypeError, binascii.Error, zlib.error) as error:
+            kind = _RENAMED_KINDS.get(data["step"], data["step"])
+            mask = unpacked(data["mask"], data["gaussians"])
+        except (KeyError, TypeError) as error:
             raise ValueError(f"not a step: {error!r}") from error
-        if kind not in get_args(Kind) or len(bits) != count:
+        if kind not in get_args(Kind):
             raise ValueError(f"not a step: {kind!r}")
-        known = ("color", "strength", "rotation", "scale", "translation", "center", "fill")
+        known = ("color", "strength", "rotation", "scale", "translation", "center", "fill", "remains")
         values = {name: data[name] for name in known if name in data}
-        return cls(kind, torch.from_numpy(bits.astype(bool)), values, str(data.get("phrase", "")))
+        return cls(kind, mask, values, str(data.get("phrase", "")))
+
+
+def packed(mask: Tensor) -> str:
+    """A mask ``[N]`` bool as text: compressed bits."""
+    bits = zlib.compress(np.packbits(mask.cpu().numpy()).tobytes(), 6)
+    return base64.b64encode(bits).decode("ascii")
+
+
+def unpacked(text: Any, count: Any) -> Tensor:
+    """The inverse of `packed` for ``count`` Gaussians.
+
+    Raises:
+        ValueError: If the text is not a mask of so many Gaussians.
+    """
+    try:
+        raw = base64.b64decode(text)
+        if type(count) is not int or not 0 <= count <= 8 * _DEFLATE * max(len(raw), 1):
+            raise ValueError(f"not a step: {len(raw)} bytes cannot hold a mask of {count!r} Gaussians"[:100])
+        content = zlib.decompressobj().decompress(raw, count // 8 + 1)
+    except (TypeError, binascii.Error, zlib.error) as error:
+        raise ValueError(f"not a step: {error!r}") from error
+    bits = np.unpackbits(np.frombuffer(content, np.uint8))[:count]
+    if len(bits) != count:
+        raise ValueError(f"not a step: a mask of {len(bits)} Gaussians, not of {count}")
+    return torch.from_numpy(bits.astype(bool))
 
 
 class Journal:

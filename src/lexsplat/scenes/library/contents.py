@@ -88,6 +88,8 @@ class Contents:
         facts: Names of the images ("views"), up direction ("world"), and the objects with name, place and size.
         spreads: Symmetric square roots of the covariances of the points (xx, xy, xz, yy, yz, zz) ``[M, 6]`` float16,
             world units; None in libraries that were made before boxes took them into account.
+        uncertainties: Mean u_G of each segment ``[S]``; None in libraries that were made before scores took it into
+            account.
     """
 
     levels: Tensor
@@ -117,6 +119,7 @@ class Contents:
     pictures: Tensor
     facts: Mapping[str, Any]
     spreads: Tensor | None = None
+    uncertainties: Tensor | None = None
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name; the facts as bytes of JSON."""
@@ -221,10 +224,15 @@ def _language(scene: Scene, segments: Segments) -> dict[str, Tensor]:
     codes = segment_codes(segments, lambda index: scene.field.select(index).code_probabilities().cpu())
     lowest = codes.distributions[torch.from_numpy(codes.numbers[0])].half()
     rows, columns = lowest.nonzero(as_tuple=True)
+    masses = torch.from_numpy(codes.masses[codes.numbers[0]])
+    doubts = torch.zeros_like(masses).index_add_(
+        0, segments.labels, segments.masses.double() * scene.field.uncertainties.cpu().double()
+    )
     tables, scale = scene.presence_classifier.tables, scene.everyday_scale
     return {
         "levels": segments.levels.int(),
-        "masses": torch.from_numpy(codes.masses[codes.numbers[0]]).float(),
+        "masses": masses.float(),
+        "uncertainties": (doubts / masses.clamp(min=1e-12)).float(),
         "rows": torch.searchsorted(rows.contiguous(), torch.arange(len(lowest) + 1)).int(),
         "columns": columns.short(),
         "shares": lowest[rows, columns],

@@ -158,7 +158,8 @@ def answer_from(contents: Contents, codes: Tensor, thing: Thing, phrase: str, te
     best = classifier.best_heights([thing.text])
     by_code = classifier.scale.relevancy(classifier.language.codebook.clip, unit, best)[:, 0].numpy()
     own = torch.from_numpy(np.clip(_spread(contents) @ by_code, 0, 1))[None]
-    scores, counts = segment_relevancy(own, _segments(contents))[0].numpy(), contents.counts.numpy()
+    scores = segment_relevancy(own, _segments(contents), contents.uncertainties)[0].numpy()
+    counts = contents.counts.numpy()
     taken = np.flatnonzero((scores >= SEGMENT_THRESHOLD) & (counts > 0))
     large = counts[taken].sum() >= _LARGE * counts.sum() and NAMES.isdisjoint(words)
     if not len(taken) or (large and words[-1] not in STUFF):
