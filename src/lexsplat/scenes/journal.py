@@ -36,7 +36,7 @@ class Step:
         mask: The Gaussians it applies to ``[N]`` bool, of those that exist before the step.
         values: Its numbers: "color" and "strength", or "rotation" ``[3, 3]``, "scale", "translation", "center"; or
             "fill", the Gaussians that close the hole (`lexsplat.scenes.filling.Fill.to_json`).
-        phrase: What was asked for, for display.
+        phrase: Phrase that was asked for, for display.
     """
 
     kind: Kind
