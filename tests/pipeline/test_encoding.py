@@ -58,7 +58,9 @@ def test_encoders_may_be_on_a_gpu_beside_a_rasterizer_on_the_cpu(monkeypatch):
     encoders = Encoders.of(config)
     assert (encoders.clip, encoders.dino) == (None, None)
     assert loaded == ["cuda", "cuda"]
-    assert config.features.tokens == BuildConfig(clip="a", dino="b").resolved("cuda", (96, 72)).features.tokens
+    assert (
+        config.features.tokens == BuildConfig(clip="a", dino="b").resolved("cuda", (96, 72)).features.tokens
+    )
 
 
 @pytest.mark.gpu

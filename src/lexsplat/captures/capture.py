@@ -192,7 +192,7 @@ class Capture:
         test_names: Names of the held-out views, sorted.
         points: Points of structure from motion ``[P, 3]``, world; P may be 0.
         point_colors: Their colors ``[P, 3]``, RGB in 0..1.
-        warnings: What was skipped and why, one line each.
+        warnings: Skipped content and the reasons, one line each.
         background: Color behind transparent pixels, RGB in 0..1.
     """
 

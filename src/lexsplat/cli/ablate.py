@@ -39,7 +39,7 @@ class Ablate:
             view.
         ground_truth: Folder with annotations: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
-        forms: How codes and text are compared, measured side by side. The paper's form is "feature".
+        forms: Forms of relevancy, measured side by side. The paper's form is "feature".
         json: Print ablation.json on standard output (docs/schemas/ablation.json).
         settings: Settings of all stages; --seed is the seed of the Gaussians.
     """

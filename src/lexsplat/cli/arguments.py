@@ -185,7 +185,7 @@ def _help_page(kind: type, hidden: set[str], defaults: dict[str, str], part: str
         kind: A command, its settings, or a part of them.
         hidden: Names of the fields to suppress.
         defaults: Defaults in words.
-        part: What the options of a part begin with, such as "averaged.".
+        part: Prefix of the options of a part, such as "averaged.".
     """
     hints = get_type_hints(kind, include_extras=True)
     fields = []

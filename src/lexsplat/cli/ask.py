@@ -24,7 +24,7 @@ class Ask:
 
     Args:
         scene: A scene folder, or the word "demo" for the bundled scene.
-        phrases: What to ask, if it does not come from standard input.
+        phrases: Phrases to ask, if they do not come from standard input.
         stdin: Answer the lines of standard input until it ends.
         clip: Text encoder: a name on the Hugging Face Hub or a folder.
         device: "auto" takes CUDA where there is a GPU.

@@ -35,7 +35,7 @@ class Compare:
         seeds: Seeds of codebook and language.
         ground_truth: Folder with annotations: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
-        protocols: How to measure (docs/evaluation.md).
+        protocols: Evaluation protocols (docs/evaluation.md).
         lpips: Measure LPIPS if it is installed; --no-lpips leaves it out.
         json: Print comparison.json on standard output (docs/schemas/comparison.json).
         settings: Settings of all stages; --seed is the seed of the Gaussians.

@@ -23,7 +23,7 @@ class Demo:
     Args:
         output: Folder for all results.
         scene: Which bundled capture: the table top, or the second and smaller one.
-        method: How language is put on the Gaussians (see lexsplat build --help).
+        method: Method that puts language on the Gaussians (see lexsplat build --help).
         device: "auto" takes CUDA where there is a GPU.
         seed: Seed of all randomness.
         iterations: Reconstruction steps.

@@ -63,8 +63,8 @@ class Edit:
 
     Args:
         scene: A scene folder, or the word "demo" for the bundled scene.
-        action: What to do; "list" shows the steps, "discard" deletes all of them.
-        select: What to change; phrases may relate things (see lexsplat find --help).
+        action: Action to take; "list" shows the steps, "discard" deletes all of them.
+        select: Phrase for the things to change; it may relate things (see lexsplat find --help).
         view: Name of the view that left and right refer to.
         threshold: Relevancy from which a Gaussian is selected.
         grow: Widen the selection by this distance in units of the scene.

@@ -29,9 +29,9 @@ class Evaluate:
         scene: A scene folder.
         ground_truth: Folder with annotations: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
-        protocols: How to measure (docs/evaluation.md).
+        protocols: Evaluation protocols (docs/evaluation.md).
         capture: Folder of the photos.
-        form: How codes and text are compared (see lexsplat query --help).
+        form: Form of relevancy (see lexsplat query --help).
         clip: Text encoder: a name on the Hugging Face Hub or a folder.
         device: "auto" takes CUDA where there is a GPU.
         json: Print metrics.json on standard output (docs/schemas/metrics.json).

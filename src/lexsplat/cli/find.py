@@ -28,7 +28,7 @@ class Find:
 
     Args:
         scene: A scene folder, or the word "demo" for the bundled scene.
-        phrases: What to look for.
+        phrases: Free-text phrases to find.
         view: Name of the view that left and right refer to.
         threshold: Relevancy from which a Gaussian belongs to a thing.
         clip: Text encoder: a name on the Hugging Face Hub or a folder.

@@ -47,7 +47,7 @@ class LibraryCommand:
     they are. Add a scene again after it was rebuilt or moved (docs/library.md).
 
     Args:
-        action: What to do.
+        action: Action to take.
         library: The folder of the library; the first "add" makes it.
         words: Scene folders or the word "demo" for add, names or folders for remove, phrases for search.
         limit: Scenes of an answer, at most.

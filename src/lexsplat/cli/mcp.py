@@ -40,7 +40,7 @@ class Mcp:
         http: Serve over HTTP instead of standard input and output.
         host: Address to listen on. Other addresses than this machine's need --token.
         port: Port to listen on.
-        token: What clients must send as "Authorization: Bearer TOKEN".
+        token: Token that clients must send as "Authorization: Bearer TOKEN".
         allow_write: Offer the tools export and edit, which write new files into --output.
         output: Folder of the files that export and edit write.
         clip: Text encoder: a name on the Hugging Face Hub or a folder.

@@ -29,15 +29,15 @@ class Query:
 
     Args:
         scene: A scene folder, or the word "demo" for the bundled scene.
-        prompts: What to look for, such as "red apple" "something to sit on".
+        prompts: Free-text prompts, such as "red apple" "something to sit on".
         view: Names of the views to answer in.
         output: Folder for the images.
         images: Write a heatmap and a mask for each prompt and view; --no-images does not.
         features: Also write the language features of each view: features/VIEW.safetensors and their principal
             components as colors, features/VIEW.png.
         threshold: Relevancy from which a pixel belongs to the mask. The paper's is 0.5.
-        form: How codes and text are compared: "feature" blends features, then compares (the paper); "code"
-            compares each code, then blends; "segment" takes whole segments by the scores of "code".
+        form: Form of relevancy: "feature" blends features, then compares (the paper); "code" compares each code, then
+            blends; "segment" takes whole segments by the scores of "code".
         negatives: Phrases that a prompt is compared with.
         temperature: Factor on cosine similarities.
         template: Sentences with {} in place of the prompt, such as "a photo of a {}".

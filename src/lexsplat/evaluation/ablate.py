@@ -78,8 +78,8 @@ class AblationPlan:
         variants: Names out of `lexsplat.language.methods.VARIANTS`; empty takes all of each method.
         methods: Names of methods. Rows of several are named "METHOD: VARIANT".
         wrong_labels: Share of the pixels of every training view whose code is replaced by a random one.
-        forms: How codes and text are compared: "feature" as in the paper, "code". Names of rows end in the form if
-            there are several.
+        forms: Forms of relevancy: "feature" as in the paper, "code". Names of rows end in the form if there are
+            several.
 
     Raises:
         ValueError: If there is no seed, form or method, the share is not within 0..1, a method is unknown, or no
@@ -110,7 +110,7 @@ def ablate(bench: Bench, plan: AblationPlan | None = None) -> list[dict[str, Any
     """Measure the variants; writes ``ablation.json``, ``.csv``, ``.tex`` and ``.html`` (`Bench.measure`).
 
     Args:
-        bench: Where they are made and measured; its settings are those of the full methods.
+        bench: Bench that makes and measures the variants; its settings are those of the full methods.
         plan: The rows and seeds; None takes all variants of the paper's method.
 
     Returns:
@@ -144,10 +144,10 @@ def language_row(
     """The row of a method of ours.
 
     Args:
-        bench: Where its language is made.
+        bench: Bench on which its language is made.
         name: Name of the row.
         config: Settings of the method; the seed is that of the run.
-        form: How codes and text are compared.
+        form: Form of relevancy.
         wrong_labels: See `AblationPlan`.
     """
     settings = [config.method, *(getattr(config, part) for part in METHODS[config.method].settings)]

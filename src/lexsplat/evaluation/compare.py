@@ -46,7 +46,7 @@ def compare(bench: Bench, plan: ComparisonPlan | None = None) -> list[dict[str, 
     needed to answer. Training time is reconstruction, features and language.
 
     Args:
-        bench: Where they are made and measured.
+        bench: Bench that makes and measures the methods.
         plan: The rows and seeds; None takes the defaults.
 
     Returns:

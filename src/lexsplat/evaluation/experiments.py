@@ -72,7 +72,7 @@ class Row:
         name: Name of the method or variant.
         settings: Everything the language depends on except seed and shared stages: dataclasses and plain data.
         make: Makes the language of a seed.
-        form: How codes and text are compared.
+        form: Form of relevancy.
     """
 
     name: str
@@ -103,8 +103,8 @@ class Bench:
         source: Folder with photos and cameras.
         output: Folder for everything that is written.
         config: Settings; ``config.seed`` is the seed of the Gaussians.
-        evaluation: How runs are measured.
-        ground_truth: Where the ground truth is read from; None takes the capture's.
+        evaluation: Settings of each evaluation.
+        ground_truth: Source of the ground truth; None takes the capture's.
         listener: Receives progress events.
 
     Raises:
@@ -276,7 +276,7 @@ class Bench:
         """Make and measure a language, unless the same settings, code and ground truth were measured before.
 
         Args:
-            row: What to make, and how to ask it.
+            row: Row of the table: language and form of relevancy.
             seed: Seed of the language.
             keep_images: Whether to keep images of every prompt in every view.
         """

@@ -29,7 +29,7 @@ def read_held_out(capture: Capture, source: GroundTruthSource) -> Annotations:
 
     Args:
         capture: The capture.
-        source: Where its ground truth is read from.
+        source: Source of its ground truth.
 
     Raises:
         CaptureError: If no held-out view has any, or as `load_annotations`.

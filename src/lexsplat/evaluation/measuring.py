@@ -89,9 +89,9 @@ def evaluate(
 
     Args:
         capture: Photos, cameras and the split.
-        scene: What is measured; the fixed threshold is that of its ``query``.
+        scene: Scene to measure; the fixed threshold is that of its ``query``.
         config: Settings.
-        ground_truth: What the language is measured against; None takes that of the capture
+        ground_truth: Annotations that the language is measured against; None takes those of the capture
             (`lexsplat.captures.load_annotations`). Masks of training views are ignored. Where there are no boxes for
             LangSplat's localization, those of the masks stand in.
         prompt_kinds: Kind of each prompt ("name", "color", "part", ...); adds the numbers of each kind.

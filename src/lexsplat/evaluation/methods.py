@@ -58,7 +58,7 @@ class MethodScene:
         field: The method.
         cameras: The training views, from which thresholds are found.
         encode_text: Texts to embeddings.
-        query: How text is compared.
+        query: Settings of the comparison with text.
     """
 
     gaussians: Gaussians

@@ -46,7 +46,7 @@ def evaluate_scene(
 
     Args:
         scene: An opened scene folder.
-        capture: Where the photos are, if not where the build found them.
+        capture: Folder of the photos, if not where the build found it.
         masks: Folder of the ground truth in any layout of `lexsplat.captures.ground_truth`, if not the capture's own.
         prompt_list: Ask the prompts of the paper or of the released code; for captures named after its scenes.
         protocols: Names out of `lexsplat.evaluation.protocols.PROTOCOLS`.

@@ -58,7 +58,7 @@ def light_tower(
     Args:
         folder: The folder, for its configuration and tokenizer.
         load: Returns the weights by their names in transformers, from files or from a loaded model.
-        device: Where it computes.
+        device: Device of the tower.
 
     Returns:
         The tower, without its ``content_hash``, which is left to the caller.
@@ -148,7 +148,7 @@ class ClipText:
         settings: The text part of its ``config.json``.
         weights: Its tensors by their names in transformers.
         tokenizer: Its tokenizer, without truncation and padding.
-        device: Where it computes.
+        device: Device of the tower.
     """
 
     content_hash: str

@@ -64,7 +64,7 @@ def model_folder(name: str, tower: str) -> Path:
 
     Args:
         name: A folder, a name on the Hugging Face Hub, or "bundled".
-        tower: What the model is used as: "clip", "dino" or "segments".
+        tower: Role of the model: "clip", "dino" or "segments".
 
     Returns:
         A folder with a configuration, weights, and for "clip" a tokenizer.

@@ -30,7 +30,7 @@ def check_names(what: str, name: str, arguments: Mapping[str, Any], schemas: Map
     """Refuse a name that is not offered, and arguments that it does not take or needs.
 
     Args:
-        what: What is called: "tool" or "prompt".
+        what: Kind of the name: "tool" or "prompt".
         name: Its name.
         arguments: Its arguments.
         schemas: The schema of the arguments of each name that is offered.

@@ -22,8 +22,8 @@ async def messages(received: Any, sent: Any) -> AsyncIterator[SessionMessage]:
     """The messages of a client.
 
     Args:
-        received: What `mcp.server.stdio.stdio_server` reads: messages, and an error for each line it cannot read.
-        sent: Where the answers to these lines go.
+        received: Stream of `mcp.server.stdio.stdio_server`: messages, and an error for each line it cannot read.
+        sent: Stream for the answers to these lines.
     """
     async with received:
         async for item in received:

@@ -19,8 +19,8 @@ def different(
     """The two different things with the smallest gap; of equal gaps, with the nearest centers.
 
     Args:
-        firsts: What the first one is chosen from.
-        seconds: What the second one is chosen from; it may share things with ``firsts``.
+        firsts: Candidates for the first thing.
+        seconds: Candidates for the second thing; some may be among ``firsts``.
         asked: The subject of the error.
 
     Returns:
@@ -56,7 +56,7 @@ def measured(*ends: tuple[Selection, Sequence[Selection], dict[str, Any]]) -> st
     """A note on the pair that was taken; "" where each phrase fits one thing.
 
     Args:
-        ends: What was taken, of which things, and how their phrase was understood.
+        ends: Thing that was taken, its candidates, and how its phrase was understood.
     """
     fits = [(shortened(asked["understood"]), len(things)) for _, things, asked in ends if len(things) > 1]
     if not fits:

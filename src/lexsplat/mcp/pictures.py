@@ -28,7 +28,7 @@ def picture(scene: Scene, view: str, phrases: Sequence[str]) -> tuple[list[dict[
     Args:
         scene: The scene.
         view: Name of a view.
-        phrases: What the heatmaps show, understood as by `Scene.find`.
+        phrases: Phrases of the heatmaps, understood as by `Scene.find`.
 
     Raises:
         QueryError: If the view is unknown or a phrase is empty.

@@ -51,7 +51,7 @@ def make_server(
 
     Args:
         scenes: The scenes by name.
-        output: Where the tools that write put their files; None offers none of these tools.
+        output: Folder of the files that tools write; None offers no tools that write.
         library: A library that is searched, and whose scenes are served as well.
     """
     server = _Server("lexsplat", version=__version__, instructions=INSTRUCTIONS, log_level="WARNING")
@@ -152,9 +152,9 @@ def serve_http(server: MCPServer, listening: socket.socket, host: str, token: st
 
     Args:
         server: The server.
-        listening: Where it listens (`lexsplat.runtime.listening.listen`).
+        listening: Listening socket (`lexsplat.runtime.listening.listen`).
         host: The address that was bound.
-        token: What each request must send; None needs none.
+        token: Token that each request must send; None requires none.
     """
     import uvicorn
 

@@ -155,7 +155,7 @@ class _Stage:
     Args:
         inputs: Everything its result depends on. The name of an earlier stage stands for all inputs of that stage.
         work: Does it; returns facts for its record.
-        outputs: What it writes.
+        outputs: Paths that it writes.
     """
 
     inputs: list[Any]

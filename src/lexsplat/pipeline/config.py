@@ -56,8 +56,8 @@ class BuildConfig:
             used for prompts only.
         memory: Host memory for photos, features and projections, such as "4GB". Libraries, encoders and Gaussians
             come on top (docs/conventions.md).
-        workers: Where views and scenes are processed: "none" is this process, "ray" the cluster of RAY_ADDRESS or the
-            cores of this machine, "ray://HOST:PORT" a cluster (docs/scaling.md).
+        workers: Workers for views and scenes: "none" is this process, "ray" the cluster of RAY_ADDRESS or the cores
+            of this machine, "ray://HOST:PORT" a cluster (docs/scaling.md).
         blocks: Number of blocks in which the Gaussians and the photos are loaded one after the other, "auto" for as
             few as fit into the memory, or "none".
         checkpoint_seconds: Seconds between two checkpoints of a training.

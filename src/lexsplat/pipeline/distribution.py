@@ -163,7 +163,7 @@ def build_scenes(
     Args:
         tasks: From `scene_tasks`.
         output: Folder of all scenes, which every worker must see.
-        workers: Where they run.
+        workers: Workers that run the tasks.
         listener: Receives an event of stage "scenes" after every scene, and one of stage "finished" or "failed" with
             its name. Of scenes under way it receives the events of their stages: in this process all, of workers the
             last one of every second.

@@ -43,7 +43,7 @@ class Encoders:
         clip: Name or folder of the image-text encoder.
         dino: Name or folder of the dense encoder, or "none".
         device: Device to compute on.
-        segments: Where 2D segments come from (`FeatureConfig.segments`).
+        segments: Source of 2D segments (`FeatureConfig.segments`).
     """
 
     def __init__(self, clip: str, dino: str, device: str, segments: str = "none") -> None:

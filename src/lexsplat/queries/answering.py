@@ -80,7 +80,7 @@ def answer(phrase: Phrase, searched: Searched) -> Selection:
 
     Args:
         phrase: From `lexsplat.queries.grammar.parse`.
-        searched: What it is asked of.
+        searched: The scene to ask.
 
     Raises:
         QueryError: If the phrase relates something to the viewer in a way that has no meaning, such as "on me".

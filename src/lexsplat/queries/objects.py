@@ -50,7 +50,7 @@ def whole_segments(codes: SegmentCodes, strengths: Strengths, words: int) -> Who
 
     Args:
         codes: The segments of all levels.
-        strengths: How well words describe them.
+        strengths: Function from a slice of the words to their strengths at each segment.
         words: Number of words W.
     """
     best, most = np.zeros(len(codes.masses), np.int64), np.full(len(codes.masses), -np.inf)

@@ -83,7 +83,7 @@ def part_scores(relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: 
         relevancy: Relevancy of each Gaussian by itself ``[N]`` in 0..1.
         thing: The Gaussians of its thing ``[N]`` bool, at least `FEWEST`.
         gaussians: The scene.
-        masses: What the training views show of each Gaussian ``[N]``.
+        masses: Visible weight of each Gaussian in the training views ``[N]``.
 
     Returns:
         ``[N]`` in 0..1, on the device of ``relevancy``; at least `SEGMENT_THRESHOLD` exactly in the part.

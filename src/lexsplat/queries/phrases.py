@@ -209,8 +209,8 @@ class Understood:
     """A parsed phrase.
 
     Args:
-        phrase: What it asks for.
-        note: What was not understood; "" if everything was.
+        phrase: Things and relations that it names.
+        note: Remark on parts not understood; "" if there are none.
         unknown: Whether nothing is certainly here: it holds words that the encoder does not know, or has no grammar.
     """
 

@@ -34,7 +34,7 @@ class Hit:
     """The surface that one pixel shows.
 
     Args:
-        point: Where the ray meets the surface ``[3]``, world units.
+        point: Point where the ray meets the surface ``[3]``, world units.
         indices: Gaussians of the surface there ``[M]``.
         weights: Their shares of the pixel ``[M]``.
     """

@@ -105,7 +105,7 @@ class PresenceClassifier:
     Args:
         gaussians: The geometry of the scene.
         language: Its language.
-        scale: What everyday words reach in it.
+        scale: Scores of everyday words in it.
         embed: Texts to embeddings ``[T, D]``.
         places: `places` of an earlier classifier of the same scene; None computes them when they are needed.
     """

@@ -121,8 +121,8 @@ def related(
 
     Args:
         relation: One that `holds` knows.
-        targets: What to choose from.
-        references: What they are related to.
+        targets: Instances to choose from.
+        references: Instances that they are related to.
         viewer: Whose left it is, or whose for each pair (`lexsplat.queries.viewers`).
     """
     pairs = [
@@ -165,10 +165,10 @@ def nearest(
     """The instance of ``targets`` with the smallest gap to any instance of ``references``, or with the largest.
 
     Args:
-        targets: What to choose from.
-        references: What the gap is to.
+        targets: Instances to choose from.
+        references: Instances to measure the gap to.
         farthest: Whether the largest gap counts.
-        count: How many are chosen; none if there are fewer.
+        count: Number of instances to choose; none if there are fewer.
         rank: The number of the first one, from 1.
     """
     gaps = [

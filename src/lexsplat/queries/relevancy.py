@@ -106,7 +106,7 @@ class Question:
         positives: Text embeddings of the prompts ``[P, D]``, of any length.
         negatives: Text embeddings of the negatives ``[M, D]``, M > 0, of any length.
         config: Temperature and form.
-        scale: What everyday words reach in the scene; replaces the negatives in form "code".
+        scale: Scores of everyday words in the scene; they replace the negatives in form "code".
         best: Heights that each prompt is compared with at each code ``[K, P]``; None takes those of the scale.
     """
 

@@ -31,7 +31,7 @@ def scores_in_form(
 
     Args:
         field: The language of the scene.
-        query: How text is compared with it.
+        query: Settings of its comparison with text.
         relevancy: ``[P, N]`` (`lexsplat.queries.relevancy.gaussian_relevancy`).
         presences: Whether the scene holds each prompt.
     """

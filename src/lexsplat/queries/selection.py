@@ -62,12 +62,12 @@ class Selection:
         scores: Relevancy of every Gaussian ``[N]`` in 0..1.
         threshold: Smallest score of a selected Gaussian.
         present: Whether the scene holds what was asked for; "yes" for selections made by hand.
-        phrase: What was asked for.
+        phrase: Phrase that was asked for.
         world: Up and scale of the scene; None takes up from the cameras.
         parts: Its instances where they are known, such as objects that touch each other; () takes clusters.
         names: Its likeliest names and their probabilities, if it is an object of `Scene.objects`.
-        seen: What the views show of the scene's segments; None renders the views.
-        note: What of the question nothing fits, and whose left is meant; "" if nothing.
+        seen: Visibility of the scene's segments in the views; None renders the views.
+        note: Remark on parts that nothing fits, and on whose left is meant; "" if there is none.
         seen_from: The view that left, right, front and behind refer to; "" where the answer depends on none.
     """
 
@@ -263,7 +263,7 @@ class Selection:
         """The instances whose peak is close to that of the best instance.
 
         Args:
-            scores: What is compared ``[N]``; None takes the scores of the selection.
+            scores: Scores to compare ``[N]``; None takes those of the selection.
 
         For the prompt "apple", part of a duck may exceed the threshold that keeps the rim of the apple, but the duck
         peaks far below the apple. Two apples have similar peaks.

@@ -48,11 +48,11 @@ def reconstruct(
     Args:
         capture: Views, split, and initial points; missing points are triangulated, and few photos get more points.
         config: Settings.
-        device: Where to train.
+        device: Device of the training.
         seed: Seed of the view order, of density control and of the points that replace missing ones.
         cache_dir: Folder where triangulated points are kept for the next call; None keeps nothing.
         memory: Budget of host memory in bytes, for the triangulation and then for Gaussians and photos.
-        checkpoint: Where the training is saved on the way, and from which it resumes.
+        checkpoint: Checkpoint to save to on the way and to resume from.
         listener: Receives an event of stage "reconstruct" every ten iterations, with "psnr" (recent training
             views, dB) and "gaussians" (their number).
 

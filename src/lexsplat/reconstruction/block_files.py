@@ -124,7 +124,7 @@ def plan(blocks: Blocks, iterations: int, rounds: int, *, pairs: bool = True) ->
     Args:
         blocks: The blocks.
         iterations: Number of steps of the whole training.
-        rounds: How often each block is visited.
+        rounds: Number of visits to each block.
         pairs: Visit two blocks together where they share cells.
     """
     views, count = sum(len(block.views) for block in blocks.blocks), len(blocks.blocks)

@@ -79,9 +79,9 @@ class BlockRun:
         device: Device to train on.
         seed: Seed of the training.
         memory: Host memory of one block in bytes.
-        folder: Where the state is kept between visits, and for the next run; every worker must see it.
+        folder: Folder of the state between visits, and for the next run; every worker must see it.
         key: Fingerprint of everything that the result depends on.
-        workers: Where the blocks are trained: one after the other in this process, or side by side.
+        workers: Workers that train the blocks: one after the other in this process, or side by side.
         listener: Receives an event of stage "blocks" after each visit.
     """
 
@@ -239,7 +239,7 @@ def reconstruct_blocks(
         points: Initial points of the whole.
         up: Up direction.
         count: Number of blocks.
-        run: How they are reconstructed.
+        run: Settings of the run.
 
     Raises:
         CaptureError: If there is no ground plane, or a block has no views.
@@ -343,7 +343,7 @@ def _visit(shared: _Shared, item: tuple[Visit, Mapping[str, bytes] | None]) -> t
     """Train a block for the steps of a visit and write its cells.
 
     Args:
-        shared: What all visits read.
+        shared: Inputs that all visits read.
         item: The visit, and the files that it reads if the workers do not see the folder.
 
     Returns:

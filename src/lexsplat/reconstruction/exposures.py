@@ -23,7 +23,7 @@ class Exposures:
     Args:
         count: Number of training photos.
         rate: Learning rate.
-        device: Where images are rendered.
+        device: Device of the rendered images.
     """
 
     def __init__(self, count: int, rate: float, device: torch.device | str) -> None:

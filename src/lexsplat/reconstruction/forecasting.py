@@ -54,7 +54,7 @@ def forecast(
         capture: Views and split.
         config: Settings.
         points: Initial points.
-        device: Where to train.
+        device: Device of the training.
         memory: Budget of host memory in bytes.
         listener: Receives an event of stage "calibrate" after each untimed step and each timed row of steps.
         joined: A training that runs the steps of a reconstruction together with those of something else.

@@ -52,7 +52,7 @@ class Reconstructor:
         capture: Views and split.
         config: Settings.
         points: Initial points, from `lexsplat.captures.sfm.triangulation.initial_points`.
-        device: Where to train.
+        device: Device of the training.
         seed: Seed of the view order and of density control.
         memory: Total budget in bytes. Cached photos take a quarter of it, at most 1 GiB; the budget does not
             affect the result.

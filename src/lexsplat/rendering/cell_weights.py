@@ -71,7 +71,7 @@ def weigh_cells(
         rows: Row of cells of each pixel row ``[H]``, ascending.
         columns: Column of cells of each pixel column ``[W]``, ascending.
         width: Number of columns of cells.
-        counts: What a pixel counts ``[H, W]`` float32, not negative.
+        counts: Weight of each pixel ``[H, W]`` float32, not negative.
     """
     total = len(pairs.members)
     first_entries, entry_counts = np.zeros(total, np.int64), np.zeros(total, np.int32)

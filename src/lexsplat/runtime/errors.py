@@ -19,7 +19,7 @@ class LexsplatError(Exception):
         subject: The file, value or option with the error.
         expected: A valid content or value.
         found: The actual content or value.
-        remedy: What the user can do.
+        remedy: Advice to the user.
 
     Attributes:
         crashes_at_exit: Whether what is left in the process would crash at its exit, so that the command line ends it

@@ -166,7 +166,7 @@ def read_json(path: Path, *, remedy: str = "") -> Any:
 
     Args:
         path: The file.
-        remedy: What the user can do if it is not valid.
+        remedy: Advice to the user if the file is not valid.
 
     Raises:
         FileFormatError: If it cannot be read, is not JSON, or is larger than 256 MiB.

@@ -112,7 +112,7 @@ def tell(stage: str, seconds: float, amount: str) -> None:
     Args:
         stage: Name of the stage.
         seconds: The forecast.
-        amount: What it is for, such as "2,000 iterations".
+        amount: Amount of work, such as "2,000 iterations".
     """
     if seconds >= _TOLD_FROM:
         log.log(NOTE, "%s: about %s for %s", stage, duration(seconds), amount)
@@ -123,7 +123,7 @@ class FirstUnits:
 
     Args:
         stage: Name of the stage.
-        units: What is counted, such as "photos".
+        units: Plural of the unit, such as "photos".
     """
 
     _ENOUGH = 1.0

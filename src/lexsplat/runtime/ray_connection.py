@@ -22,7 +22,7 @@ def connect(place: str, tries: int = 2) -> None:
 
     Args:
         place: "local" for a Ray of this process alone, an address of a cluster, or "ray://HOST:PORT".
-        tries: How often this is tried.
+        tries: Number of tries.
 
     Raises:
         WorkersError: If it is not reached.

@@ -58,10 +58,10 @@ class Tasks:
 
     Args:
         task: The remote function.
-        work: What it runs.
+        work: Function that the tasks run.
         everyone: Reference to what all tasks read.
         items: The items by name.
-        needs: What one task needs.
+        needs: Resources that one task needs.
     """
 
     def __init__(

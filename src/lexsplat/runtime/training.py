@@ -94,7 +94,7 @@ def run_training(
         stage: Stage name in events.
         name: Name of the training in warnings and errors.
         every: Steps between two events; the last step always sends one.
-        checkpoint: Where the state is saved between steps; None saves nothing.
+        checkpoint: Checkpoint of the state between steps; None saves nothing.
         listener: Receives progress events.
 
     Raises:

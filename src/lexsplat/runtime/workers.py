@@ -50,7 +50,7 @@ class Outcome:
 
     Args:
         name: Name of its item.
-        result: What it returned; None if it failed.
+        result: Return value of the task; None if it failed.
         error: Why the task itself failed. A lost worker is not a failure: the task is repeated.
     """
 
@@ -112,10 +112,10 @@ class Workers(Protocol):
 
         Args:
             work: A function of a module. It may run more than once for an item, so it writes files atomically.
-            shared: What all tasks read, sent to each worker once.
+            shared: Data that all tasks read, sent to each worker once.
             items: The inputs that differ between tasks, by name of the task. An item is looked up when its task
                 begins, so that a mapping may load large ones then.
-            needs: What one task needs.
+            needs: Resources that one task needs.
 
         Yields:
             The outcomes in the order of the items.
@@ -256,7 +256,7 @@ class SharedFolder:
         """The folder, for a worker.
 
         Args:
-            files: What `read` returned, for workers that do not see the folder: they get one of their own with these
+            files: Files from `read`, for workers that do not see the folder: they get one of their own with these
                 files, for the time of the task. None means the folder itself.
 
         Raises:

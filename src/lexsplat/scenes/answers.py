@@ -68,7 +68,7 @@ class Answers:
         presences: Whether the scene holds what each prompt names.
         scene: The scene that was asked.
         automatic: Whether the thresholds come from the scene; False if they were given.
-        words: What the scene keeps of each prompt; () keeps nothing.
+        words: Cached answers to each prompt; () keeps nothing.
     """
 
     prompts: tuple[str, ...]
@@ -190,10 +190,10 @@ def answer_queries(
 
     Args:
         scene: The scene to ask.
-        prompts: What to look for.
+        prompts: Free-text prompts.
         views: Names of views; none means up to `MAX_DEFAULT_VIEWS` held-out views.
         threshold: Relevancy threshold of the masks; None derives one for each prompt.
-        folder: Where ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png`` go; None writes no images.
+        folder: Folder of ``PROMPT/VIEW.png`` and ``PROMPT/VIEW.mask.png``; None writes no images.
 
     Returns:
         ``{"scene", "form", "rests_on" (see `rests_on`), "prompts": [...]}``; a prompt has "threshold", "peak",
@@ -271,7 +271,7 @@ def find_phrases(
 
     Args:
         scene: The scene to ask.
-        phrases: What to look for, with relations (`lexsplat.queries.phrases`).
+        phrases: Free-text phrases, with relations (`lexsplat.queries.phrases`).
         view: Name of the view that "left" and "right" refer to; None takes one for each relation.
         threshold: Smallest score of a selected Gaussian; None derives one for each phrase.
 

@@ -45,7 +45,7 @@ def completed(image: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     Args:
         image: RGB ``[H, W, 3]``.
         hole: Pixels to paint ``[H, W]``, at least one.
-        trust: How much the color of a pixel counts ``[H, W]``, 0 where it is unknown and in the hole.
+        trust: Weight of the color of each pixel ``[H, W]``, 0 where it is unknown and in the hole.
     """
     image = image.clip(0, 1)
     radius = max(float(np.sqrt(hole.sum() / np.pi)), 2.0)
@@ -88,8 +88,8 @@ def self_similar_shifts(pattern: FloatArray, weights: FloatArray, trust: FloatAr
 
     Args:
         pattern: The image ``[H, W, C]``.
-        weights: How much a pixel counts ``[H, W]``.
-        trust: How much a pixel of the shifted image counts ``[H, W]``.
+        weights: Weight of each pixel ``[H, W]``.
+        trust: Weight of each pixel of the shifted image ``[H, W]``.
     """
     overlap = _correlation(weights, trust)
     total = np.zeros_like(overlap)
@@ -121,7 +121,7 @@ def _voted(values: FloatArray, errors: FloatArray, trusts: FloatArray) -> FloatA
     Args:
         values: The pixels to which each of K shifts leads.
         errors: Their errors ``[F, K]``.
-        trusts: How much the values are trusted ``[F, K]``; 0 are left out.
+        trusts: Weights of the values ``[F, K]``; values of weight 0 are left out.
     """
     least = np.where(trusts > 0, errors, np.inf).min(1)
     least = np.where(np.isfinite(least), least, 0.0)[:, None]

@@ -71,7 +71,7 @@ def find_in(
     Args:
         scene: The scene to ask.
         understood: The phrase.
-        camera: Where "left" and "me" refer to; None lets the views decide that show both things
+        camera: Camera that "left" and "me" refer to; None lets the views decide that show both things
             (`lexsplat.queries.viewers`), and takes the camera in the middle of all for "me".
         threshold: See `Scene.select`. With an automatic threshold, an answer "no" has no Gaussians. The note names
             the things that do not reach a given one.

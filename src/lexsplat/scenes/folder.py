@@ -99,7 +99,7 @@ class SceneFolder:
 
     Args:
         root: The folder.
-        content: Where record, cameras, Gaussians and language are, if not in ``root`` (`lexsplat.scenes.previous`).
+        content: Folder of record, cameras, Gaussians and language, if not ``root`` (`lexsplat.scenes.previous`).
 
     Raises:
         SceneFolderError: If there is a ``scene.json`` of another format version.

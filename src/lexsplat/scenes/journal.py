@@ -37,7 +37,7 @@ class Step:
         values: Its numbers: "color" and "strength", or "rotation" ``[3, 3]``, "scale", "translation", "center"; or
             "fill", the Gaussians that close the hole (`lexsplat.scenes.filling.Fill.to_json`), and "remains", those
             that are deleted where a thing is moved away (`packed`).
-        phrase: What was asked for, for display.
+        phrase: Phrase that was asked for, for display.
     """
 
     kind: Kind

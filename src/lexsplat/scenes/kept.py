@@ -47,7 +47,7 @@ class KeptObjects:
 
     Args:
         objects: The objects, as `lexsplat.scenes.objects.objects_of` finds them.
-        places: Where presence is decided (`lexsplat.queries.presence`).
+        places: Places where presence is decided (`lexsplat.queries.presence`).
     """
 
     objects: tuple[Selection, ...]
@@ -109,7 +109,7 @@ def keep_for(
 
     Args:
         folder: The scene folder.
-        device: Where it is computed.
+        device: Device of the computation.
         listener: Receives the stages "words" and "views".
         text_tower: The encoder of its texts, if it is loaded already.
     """

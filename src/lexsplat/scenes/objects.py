@@ -83,7 +83,7 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
 
     Args:
         scene: The scene.
-        vocabulary: What they may be called; () takes the everyday names of `lexsplat.queries.vocabulary`.
+        vocabulary: Candidate names of the objects; () takes the everyday names of `lexsplat.queries.vocabulary`.
 
     Returns:
         Selections that share no Gaussian, each with its name in ``phrase`` and its likeliest names in ``names``.
@@ -137,7 +137,7 @@ def list_document(
     Args:
         scene: The scene.
         vocabulary: Candidate names of objects (`objects_of`).
-        picture: Where the sheet of thumbnails goes; None writes none.
+        picture: File of the sheet of thumbnails; None writes none.
     """
     things = scene.objects if not vocabulary else objects_of(scene, vocabulary)
     if picture is not None:

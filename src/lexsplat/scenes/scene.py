@@ -73,7 +73,7 @@ class Scene:
         field: Their language.
         views: The views by name.
         clip: Name or folder of the text encoder that belongs to the language.
-        query: How text is compared with the scene.
+        query: Settings of the comparison with text.
         folder: The folder that the scene was opened from, if any.
         encode_text: Texts to embeddings, in place of the encoder that ``clip`` names.
     """
@@ -210,7 +210,7 @@ class Scene:
         A prompt with words that are not understood, or that the encoder does not know, is "unsure" at most.
 
         Args:
-            prompts: What to look for.
+            prompts: Free-text prompts.
             threshold: Smallest score of a selected Gaussian, in 0..1; None derives one for each prompt from the
                 training views (`lexsplat.queries.thresholds.scene_thresholds`).
             checked: Whether the prompts are names of things, whose words are not checked (again).
@@ -266,7 +266,7 @@ class Scene:
         """The Gaussians that match a phrase, with instances, boxes and a best view.
 
         Args:
-            phrase: What to look for.
+            phrase: Free-text phrase.
             threshold: Smallest score of a selected Gaussian, in 0..1; None derives one from the scene and drops
                 instances that score far worse than the best one (`Selection.convincing`).
 
@@ -287,7 +287,7 @@ class Scene:
         `lexsplat.queries.grammar` describes the grammar.
 
         Args:
-            phrase: What to look for.
+            phrase: Free-text phrase.
             view: The view that "left" and "right" refer to; None takes the one that shows the reference best.
             threshold: See `select`.
 

@@ -171,7 +171,7 @@ def looked_up(
         gone: The Gaussians of a thing ``[N]``.
         places: Points of the world.
         cameras: The views.
-        slack: How far before a place a surface may lie that is taken for it, world units.
+        slack: Depth tolerance, world units: a surface up to this far before a place is taken for it.
 
     Returns:
         The share of the views that see each place ``[M]``, the share that have the thing there or before it ``[M]``,

@@ -41,7 +41,7 @@ class Guard:
     Args:
         app: The application.
         names: Allowed host names besides addresses and ``localhost``.
-        token: What a visitor has to know; "" admits everyone.
+        token: Token that a visitor has to know; "" admits everyone.
     """
 
     def __init__(self, app: ASGIApp, names: Iterable[str] = (), token: str = "") -> None:

@@ -52,7 +52,7 @@ class ViewerServer:
 
     Args:
         scene: The scene to show.
-        config: Where and how it is served; None takes the defaults.
+        config: Settings of the server; None takes the defaults.
 
     Raises:
         BackendError: If the address cannot be used.

@@ -17,7 +17,7 @@ def find_ignore_masks(folders: Sequence[Path], names: Iterable[str]) -> tuple[di
     """The mask files of photos.
 
     Args:
-        folders: Where masks may be; the first existing folder is used.
+        folders: Folders that may hold masks; the first existing one is used.
         names: Names of the photos.
 
     Returns:

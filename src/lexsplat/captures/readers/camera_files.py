@@ -49,7 +49,7 @@ class CameraFiles:
         missing: Names of images that have a camera but no file.
         test_names: The split that the files prescribe, or None.
         background: Color behind transparent pixels.
-        warnings: What was skipped and why.
+        warnings: Skipped content and the reasons.
     """
 
     root: Path

@@ -208,7 +208,7 @@ def map_photos(
     Args:
         database: Features and matches.
         photos: The photos.
-        mapper: How models are found.
+        mapper: Mapper that finds the models.
         seed: Seed for pycolmap.
         another: Called for each registered photo.
     """

@@ -83,7 +83,7 @@ class PhotoPoses:
         unregistered: Names of the photos without a pose, sorted.
         points: Number of triangulated points.
         models: Number of models that could not be joined; the largest is kept.
-        mapper: How the model was found.
+        mapper: Mapper that found the model.
         all_pairs: Whether photos left over by sequential matching were matched with all others for it.
         notes: Remarks for the user, one line each.
     """
@@ -129,7 +129,7 @@ def poses_from_photos(
 
     Args:
         folder: The photos, in subfolders or in ``images/``; ``masks/`` are used (see `prepare_photos`).
-        output: Where ``sparse/0`` is written, atomically; an existing model is replaced.
+        output: Folder of ``sparse/0``, written atomically; an existing model is replaced.
         config: Settings.
         seed: Seed for pycolmap.
         memory: Bytes of host memory available. Determines threads and batches, never the result.

@@ -89,7 +89,7 @@ def find_photos(folder: Path, without: Path | None = None) -> list[str]:
     """Names of all photos below a folder, relative to it, with "/", sorted.
 
     Args:
-        folder: Where to look; its ``masks/`` and ``segmentations/`` hold no photos.
+        folder: Folder to search; its ``masks/`` and ``segmentations/`` hold no photos.
         without: A folder to skip: the output, where that lies among the photos.
     """
     apart = {folder / name for name in _APART}

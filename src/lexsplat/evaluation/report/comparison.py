@@ -84,7 +84,7 @@ def write_comparison(
         title: Heading of the page.
         columns: Keys of the table; empty: the columns of the paper's Table 1 and ours.
         config: Settings, with "seeds".
-        machine: What it ran on.
+        machine: Facts about the machine.
     """
     rows = table_rows({method.name: method.results for method in methods})
     ranked = _worst_first(methods)

@@ -122,7 +122,7 @@ def average_features(
             several times, for a range of feature dimensions each. Means that need more than the bound of the host are
             kept in a file. The result does not depend on it.
         scratch: Folder for that file; None takes the system's.
-        workers: Where the sums of each shard of views are made. The result does not depend on it.
+        workers: Workers that sum each shard of views. The result does not depend on them.
         listener: Receives events of stage "average".
 
     Raises:

@@ -79,8 +79,8 @@ class FitRun:
         seed: Seed of all randomness.
         memory: Host memory that the fit may take, in bytes.
         scratch: Folder for temporary files; None takes the system's.
-        workers: Where work that is a sum over views runs.
-        checkpoint: Where a training is saved and resumed from; None saves nothing.
+        workers: Workers that compute sums over views.
+        checkpoint: Checkpoint to save to and resume from; None saves nothing.
         listener: Receives progress events.
     """
 

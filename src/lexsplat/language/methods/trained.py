@@ -98,7 +98,7 @@ def train_field(
         listener: Receives events of stage "language" with the losses.
         memory: Host memory in bytes, a quarter of which projections kept between steps may take (at most
             `MAX_STORE`). The result does not depend on it.
-        checkpoint: Where the training is saved and resumed from; None saves nothing.
+        checkpoint: Checkpoint to save to and resume from; None saves nothing.
 
     Raises:
         ValueError: If there is no view, or a view has no index map.

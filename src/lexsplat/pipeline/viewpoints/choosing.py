@@ -305,7 +305,7 @@ def is_hidden(depth: NDArray[np.float32], camera: Camera, target: Target) -> boo
     Args:
         depth: Depth ``[H, W]``, infinite where nothing is drawn.
         camera: The camera.
-        target: What is in the middle of its image.
+        target: Target in the middle of its image.
     """
     rows, columns = (slice(size * 2 // 5, size * 3 // 5) for size in depth.shape)
     distance = float(np.linalg.norm(camera.position - target.center))

@@ -20,7 +20,7 @@ class Pieces:
     Args:
         points: Their centers ``[M, 3]``, world.
         normals: Unit normals ``[M, 3]``, either way.
-        flatness: How flat they are ``[M]``, in 0..1.
+        flatness: Flatness of each piece ``[M]``, in 0..1.
         reach: Distance to the twelfth of the nearest points, of which each is its own first ``[M]``, world units.
     """
 

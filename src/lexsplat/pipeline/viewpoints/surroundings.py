@@ -98,8 +98,8 @@ def find_surroundings(
     Args:
         gaussians: The scene.
         up: The up direction of the user; None estimates it.
-        look: How much the splat looks like surfaces from above its ground, in 0..1, as a function of the whole and
-            the up direction; helps to estimate it.
+        look: Function of the whole and the up direction. It returns the share of surfaces in views from above the
+            ground, in 0..1, and helps to estimate the direction.
         subject: The file, for errors.
         seed: Seed of the sample and of the targets.
         warn: Warn of an up direction that is a guess or seems wrong, and of a flat scene.

@@ -46,7 +46,7 @@ class UpwardDirections:
 
     Args:
         directions: Unit vectors, more than 20 degrees apart.
-        scores: How likely each is up; only differences mean something.
+        scores: Likelihood score of each; only differences mean something.
         grounds: Share of the scene under which a ground lies ``[D]``.
         reliable: Whether the first one is up; else it is a guess.
     """
@@ -74,7 +74,7 @@ def find_upward(points: Points, look: Callable[[Points], float]) -> UpwardDirect
 
     Args:
         points: Solid points ``[M, 3]`` of the middle of the scene.
-        look: How much the splat looks like surfaces from above, in 0..1, if a direction is up.
+        look: Function of an up direction that returns the share of surfaces in views from above, in 0..1.
     """
     pieces = Pieces.of(points)
     candidates = up_candidates(pieces)

@@ -83,7 +83,7 @@ def weigh_cells(
         cell_rows: Row of cells of each pixel row ``[H]``, ascending.
         cell_columns: Column of cells of each pixel column ``[W]``, ascending.
         cells_x: Number of columns of cells.
-        counts: What a pixel counts ``[H, W]``, not negative.
+        counts: Weight of each pixel ``[H, W]``, not negative.
         first_entries: Receives the first entry of each pair, in the list by Gaussian, within the result ``[M]``.
         entry_counts: Receives the number of entries of each pair ``[M]``; 0 on input.
 

@@ -69,7 +69,7 @@ class Contents:
         mean: Mean of the everyday words ``[D]``.
         best: The best height of an everyday word at each code ``[K]``.
         best_colored: The same with the scene's objects in any color ``[K]``.
-        peak: How high the scene's own things reach ``[1]``.
+        peak: Height that the scene's own things reach ``[1]``.
         counts: Number of visible Gaussians of each segment ``[S]`` int32.
         opacities: Their total opacity ``[S]``.
         spacings: Median distance of a Gaussian of the segment to its sixth neighbor ``[S]``, world units.
@@ -83,7 +83,7 @@ class Contents:
         sizes: Width and height of the images in pixels ``[W, 2]`` int32.
         intrinsics: Of the images, in pixels ``[W, 3, 3]``.
         poses: World to camera ``[W, 4, 4]``.
-        ends: Where the files of the images end ``[W]`` int32.
+        ends: End of each image file in ``pictures`` ``[W]`` int32.
         pictures: The files, JPEG, one after the other, uint8.
         facts: Names of the images ("views"), up direction ("world"), and the objects with name, place and size.
         spreads: Symmetric square roots of the covariances of the points (xx, xy, xz, yy, yz, zz) ``[M, 6]`` float16,

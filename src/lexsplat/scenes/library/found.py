@@ -141,9 +141,9 @@ class Found:
     """The answer of a library.
 
     Args:
-        phrase: What was asked for.
-        understood: What was searched: how it was parsed, with typing errors corrected as for the first hit.
-        note: What was not understood, corrected or not found; with the scenes if it does not hold for all hits.
+        phrase: Phrase that was asked for.
+        understood: Phrase that was searched: as it was parsed, with typing errors corrected as for the first hit.
+        note: Remark on words corrected, not understood or not found; with the scenes if not all hits share it.
         hits: The scenes that hold it: "yes" before "unsure", then by their bounds.
         scenes: Number of scenes in the library.
         opened: Number of scenes that were asked themselves.

@@ -52,7 +52,7 @@ class Indexed:
 
     Args:
         answer: As of `lexsplat.scenes.answers.find_phrase`.
-        contents: What it was made from.
+        contents: Contents that it was made from.
         view: Number of the image that shows the first thing best; -1 if none does.
         frame: Left, upper, right and lower pixel of that thing in it.
     """
@@ -116,7 +116,7 @@ def decidable(phrase: str, clip: str) -> Thing | None:
     """The thing that a phrase names, if the index can answer it; None if scenes must be searched themselves.
 
     Args:
-        phrase: What is looked for.
+        phrase: Free-text phrase.
         clip: Name of the encoder.
     """
     understood = understand(phrase)
@@ -137,7 +137,7 @@ def answer_from(contents: Contents, codes: Tensor, thing: Thing, phrase: str, te
     """The answer of a scene, from what is kept of it.
 
     Args:
-        contents: What is kept.
+        contents: Contents of the scene.
         codes: Codewords of unit length ``[K, D]``.
         thing: The thing that is looked for (`decidable`).
         phrase: The phrase that named it.

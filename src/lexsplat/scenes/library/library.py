@@ -66,7 +66,7 @@ class Library:
 
     Args:
         root: Its folder.
-        device: Where scenes are opened: "auto", "cpu" or "cuda".
+        device: Device of the opened scenes: "auto", "cpu" or "cuda".
         index: Address of an index server, such as "http://localhost:8000"; None compares with all scenes.
 
     Raises:
@@ -408,7 +408,7 @@ class Library:
         """The scenes that hold what a phrase names, with its places in them.
 
         Args:
-            phrase: What to look for; with relations as in `Scene.find`.
+            phrase: Free-text phrase, with relations as in `Scene.find`.
             limit: Number of scenes, at most.
             confirm: Search the scenes themselves, even where the index suffices.
 

@@ -119,7 +119,7 @@ def _notes_without_hits(phrase: Phrase, clip: str, mended: bool) -> Iterator[str
     """Notes of an encoder without a hit.
 
     Args:
-        phrase: What was asked for.
+        phrase: Phrase that was asked for.
         clip: Name of the encoder.
         mended: Whether to note what was searched in place of typing errors.
     """
