@@ -10,7 +10,7 @@ from support.language_scene import make_scene
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.language.segments import Segments
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.visibility import hidden_gaussians, whole_things
+from lexsplat.queries.visibility import hidden_gaussians, whole_things, with_remains
 from lexsplat.rendering import accumulate_weights
 
 
@@ -65,3 +65,22 @@ def test_a_scene_without_segments_keeps_the_selection(ball):
     mask = torch.arange(440) < 300
     chosen = selected(gaussians, mask)
     assert whole_things(chosen, torch.zeros(440, dtype=torch.bool), None) is chosen
+
+
+def test_hidden_gaussians_beside_a_thing_stay_but_do_not_remain_where_it_is_deleted(ball):
+    gaussians, _, masses = ball
+    hidden = torch.arange(440) >= 400  # the core, and what lies twice as far out as the shell
+    labels = (torch.arange(440) >= 400).long()
+    segments = Segments(labels, masses, torch.tensor([[0, 1]]))
+    chosen = selected(gaussians, ~hidden)
+    whole = whole_things(chosen, hidden, segments).mask
+    assert torch.equal(whole, torch.arange(440) < 420), "the nearest Gaussians of all others are the thing's"
+    assert with_remains(chosen, hidden, segments).mask.all()
+
+
+def test_what_hides_in_a_thing_does_not_remain_whatever_lies_next_to_it(ball):
+    gaussians, _, masses = ball
+    segments = Segments((torch.arange(440) >= 400).long(), masses, torch.tensor([[0, 1]]))
+    chosen, hidden = selected(gaussians, torch.arange(440) < 400), torch.arange(440) == 405
+    assert not whole_things(chosen, hidden, segments).mask[405], "its neighbors are those of the core"
+    assert with_remains(chosen, hidden, segments).mask[405]

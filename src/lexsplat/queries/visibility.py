@@ -1,7 +1,8 @@
 """Hidden Gaussians: those inside things, or under them, which the training views hardly show.
 
 Nothing shows what they mean. A selection of what can be seen leaves them out, so that boxes and silhouettes end where
-things end. An edit of a thing takes those inside it along (`whole_things`), so that less of a core stays behind.
+things end. An edit of a thing takes those inside it along (`whole_things`), and a deletion also those under it
+(`with_remains`), so that less of a core stays behind.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
@@ -25,6 +26,8 @@ _HIDDEN = 0.05
 """Gaussians of which the views show a smaller share are hidden. Chosen on the second scene among 0.005 to 0.1."""
 _MOSTLY = 0.5
 _NEIGHBORS, _BESIDE = 6, 2
+_GROWN = 1.05
+"""Factor by which the convex hull of a thing is enlarged."""
 _VIEWS = 64
 _ROWS = 1 << 14
 """Gaussians that are projected at a time: their arrays stay in the cache of a core."""
@@ -84,8 +87,8 @@ def without_hidden(chosen: Selection, hidden: Tensor) -> Selection:
 def whole_things(chosen: Selection, hidden: Tensor, segments: Segments | None) -> Selection:
     """A selection extended by the borders of its things and the hidden Gaussians in them.
 
-    A segment belongs to it if half of what the views show of the segment is selected, and a hidden Gaussian if two of
-    its six nearest neighbors that can be seen are.
+    A segment belongs to it if half of what the views show of the segment is selected. A hidden Gaussian belongs to it
+    if two of its six nearest neighbors that can be seen do, and it lies within the convex hull of a thing.
 
     Args:
         chosen: The selection.
@@ -94,14 +97,59 @@ def whole_things(chosen: Selection, hidden: Tensor, segments: Segments | None) -
     """
     if segments is None or not chosen:
         return chosen
-    count, mask = segments.levels.shape[1], chosen.mask.cpu().numpy().copy()
+    shown = _with_borders(chosen, segments)
+    inner = _beside(shown, hidden) & inside_hulls(shown, hidden)
+    return replace(shown, mask=shown.mask | inner)
+
+
+@torch.no_grad()
+def with_remains(chosen: Selection, hidden: Tensor, segments: Segments | None) -> Selection:
+    """A selection extended by all that would stay behind if its things were taken away.
+
+    Beyond `whole_things`, it has every hidden Gaussian within their hulls, such as what is in a mug, and those beside
+    them outside their hulls, such as below a foot.
+    """
+    if segments is not None and chosen:
+        shown = _with_borders(chosen, segments)
+        chosen = replace(shown, mask=shown.mask | _beside(shown, hidden))
+    return replace(chosen, mask=chosen.mask | inside_hulls(chosen, hidden))
+
+
+def _with_borders(chosen: Selection, segments: Segments) -> Selection:
+    """A selection with the segments that are selected for the most part."""
+    count, mask = segments.levels.shape[1], chosen.mask.cpu().numpy()
     labels, masses = segments.labels.cpu().numpy(), segments.masses.cpu().double().numpy()
     taken = np.bincount(labels, masses * mask, count) >= _MOSTLY * np.bincount(labels, masses, count)
-    mask |= (taken & (np.bincount(labels, mask, count) > 0))[labels]
-    unsure = np.flatnonzero(hidden.cpu().numpy() & ~mask)
-    firm = np.flatnonzero(~hidden.cpu().numpy())
+    taken &= np.bincount(labels, mask, count) > 0
+    return replace(chosen, mask=torch.from_numpy(mask | taken[labels]).to(chosen.mask.device), parts=())
+
+
+def _beside(chosen: Selection, hidden: Tensor) -> Tensor:
+    """The hidden Gaussians beside selected ones ``[N]`` bool, which are not selected themselves."""
+    mask, unseen = chosen.mask.cpu().numpy(), hidden.cpu().numpy()
+    unsure, firm = np.flatnonzero(unseen & ~mask), np.flatnonzero(~unseen)
+    found = np.zeros(len(mask), bool)
     if len(unsure) and len(firm) >= _NEIGHBORS:
         means = chosen.gaussians.means.detach().cpu().double().numpy()
         _, nearest = cKDTree(means[firm]).query(means[unsure], k=_NEIGHBORS)
-        mask[unsure] = mask[firm[nearest]].sum(1) >= _BESIDE
-    return replace(chosen, mask=torch.from_numpy(mask).to(chosen.mask.device), parts=())
+        found[unsure] = mask[firm[nearest]].sum(1) >= _BESIDE
+    return torch.from_numpy(found).to(chosen.mask.device)
+
+
+def inside_hulls(chosen: Selection, hidden: Tensor) -> Tensor:
+    """The hidden Gaussians inside the instances of a selection ``[N]`` bool."""
+    means, inside = chosen.gaussians.means.detach().cpu().double().numpy(), np.zeros(len(chosen.mask), bool)
+    for each in chosen.instances:
+        inside |= inside_hull(means, each.mask.cpu().numpy())
+    return torch.from_numpy(inside).to(hidden.device) & hidden
+
+
+def inside_hull(means: NDArray[np.float64], thing: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which Gaussians lie in the convex hull of a thing, enlarged about its center ``[N]``."""
+    points = means[thing]
+    try:
+        corners = points[ConvexHull(points).vertices] if len(points) > 3 else points
+        center = corners.mean(0)
+        return np.asarray(Delaunay(center + _GROWN * (corners - center)).find_simplex(means) >= 0)
+    except (QhullError, ValueError, IndexError):  # flat or too few
+        return thing.copy()

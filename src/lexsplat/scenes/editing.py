@@ -22,10 +22,10 @@ from torch import Tensor
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.visibility import whole_things
+from lexsplat.queries.visibility import whole_things, with_remains
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
-from lexsplat.scenes.filling import Fill, fill_for, hidden_inside
+from lexsplat.scenes.filling import Fill, fill_for
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.journal import Journal, Kind, Step, packed, unpacked
@@ -48,10 +48,7 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
         raise ValueError(f"a step for {len(step.mask)} Gaussians does not fit {len(gaussians)}")
     mask = step.mask.to(gaussians.device)
     if step.kind in ("delete", "keep"):
-        kept = mask if step.kind == "keep" else ~mask
-        if "fill" in step.values:
-            return _filled(gaussians, language, kept, Fill.from_json(step.values["fill"]))
-        return gaussians.select(kept), language.select(kept)
+        return _without(gaussians, language, mask if step.kind == "keep" else ~mask, step)
     if step.kind == "duplicate":
         everything = torch.arange(len(gaussians), device=gaussians.device)
         index = torch.cat([everything, everything[mask]])
@@ -71,16 +68,19 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
         tensors[name] = tensor.clone()
         tensors[name][mask] = getattr(changed, name)
     changed = replace(gaussians, **tensors)
-    if "fill" not in step.values:
+    if "remains" not in step.values:
         return changed, language
     remains = unpacked(step.values["remains"], len(gaussians)).to(mask.device)
-    return _filled(changed, language, ~remains, Fill.from_json(step.values["fill"]))
+    return _without(changed, language, ~remains, step)
 
 
-def _filled(
-    gaussians: Gaussians, language: LanguageField, kept: Tensor, fill: Fill
+def _without(
+    gaussians: Gaussians, language: LanguageField, kept: Tensor, step: Step
 ) -> tuple[Gaussians, LanguageField]:
-    """Some Gaussians of a scene and those of a fill, which take the language of their sources."""
+    """Some Gaussians of a scene and those of the fill of a step, which take the language of their sources."""
+    if "fill" not in step.values:
+        return gaussians.select(kept), language.select(kept)
+    fill = Fill.from_json(step.values["fill"])
     remain, added = gaussians.select(kept), fill.gaussians(gaussians)
     sources = torch.from_numpy(fill.sources.astype(np.int64)).to(kept.device)
     tensors: dict[str, Any] = {
@@ -278,16 +278,10 @@ class Editor:
     def planned_mask(self, kind: Kind, chosen: Selection) -> Tensor:
         """The Gaussians that a step would apply to ``[N]`` bool; it changes nothing.
 
-        A deletion with a fill also takes remains under the thing that no view shows (`lexsplat.scenes.filling`).
+        A deletion also takes what hides under the thing (`lexsplat.queries.visibility.with_remains`).
         """
-        return self._whole(chosen, fill=kind in ("delete", "move")).mask
-
-    def _whole(self, chosen: Selection, fill: bool) -> Selection:
-        """A selection extended to whole things; with ``fill``, also by the hidden Gaussians inside them."""
-        whole = whole_things(chosen, self.scene.hidden, self.scene.field.segments)
-        if not fill:
-            return whole
-        return replace(whole, mask=whole.mask | hidden_inside(whole, self.scene.hidden))
+        extend = with_remains if kind == "delete" else whole_things
+        return extend(chosen, self.scene.hidden, self.scene.field.segments).mask
 
     def _do(self, kind: Kind, chosen: Selection, fill: bool = False, **values: Any) -> None:
         if len(chosen.mask) != len(self.scene.gaussians):
@@ -299,17 +293,17 @@ class Editor:
                 found="nothing",
                 remedy="try other words or a lower threshold",
             )
-        whole = self._whole(chosen, fill)
-        mask = whole.mask
+        mask = self.planned_mask(kind, chosen)
         if fill:
+            taken = replace(chosen, mask=self.planned_mask("delete", chosen), parts=())
             cameras = [view.camera for view in self.original.views.values() if view.split == "train"]
-            found, gone = fill_for(whole, cameras, self.original.listener)
+            found, gone = fill_for(taken, cameras, self.original.listener)
             if found is not None:
                 values["fill"] = found.to_json()
-            if kind == "delete":
-                mask = gone
-            elif found is not None:
+            if kind == "move":
                 values["remains"] = packed(gone & ~mask)
+            else:
+                mask = gone
         step = Step(kind, mask.clone().cpu(), values, chosen.phrase)
         with self._change(step.to_json()):
             self._advance(step)

@@ -22,13 +22,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
-from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.queries.selection import Selection
+from lexsplat.queries.visibility import inside_hull
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.completing import completed
 from lexsplat.scenes.surfaces import (
@@ -61,19 +62,6 @@ _SIZES = (0.8, 0.8, 0.1)
 _OPAQUE = 3.0
 _COLUMNS = 13
 _MOST = 1 << 20
-_GROWN = 1.05
-"""Factor by which the convex hull of a thing is enlarged."""
-
-
-def inside_hull(means: FloatArray, thing: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which Gaussians lie in the convex hull of a thing, enlarged about its center ``[N]``."""
-    points = means[thing]
-    try:
-        corners = points[ConvexHull(points).vertices] if len(points) > 3 else points
-        center = corners.mean(0)
-        return np.asarray(Delaunay(center + _GROWN * (corners - center)).find_simplex(means) >= 0)
-    except (QhullError, ValueError, IndexError):  # flat or too few
-        return thing.copy()
 
 
 class Fill(NamedTuple):
@@ -136,14 +124,6 @@ class Fill(NamedTuple):
         if found.find_invalid():
             raise ValueError(f"the fill has {found.find_invalid()}")
         return found
-
-
-def hidden_inside(chosen: Selection, hidden: Tensor) -> Tensor:
-    """The hidden Gaussians inside the instances of a selection ``[N]`` bool."""
-    means, inside = chosen.gaussians.means.detach().cpu().double().numpy(), np.zeros(len(chosen.mask), bool)
-    for each in chosen.instances:
-        inside |= inside_hull(means, each.mask.cpu().numpy())
-    return torch.from_numpy(inside).to(hidden.device) & hidden
 
 
 def fill_for(
