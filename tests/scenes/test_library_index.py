@@ -65,7 +65,7 @@ def test_presence_is_that_of_the_scene_and_counts_and_places_nearly_always(demo_
     colored = ["green apple", "red apple", "yellow banana", "white vase", "mug handle", "toy", "fruit"]
     words = list(dict.fromkeys([*default_vocabulary("bundled"), *everyday_words()[::9], *colored]))
     scene.embed(words)
-    presences, counts, apart, sizes = [], [], [], []
+    presences, counts, apart, sizes, scores = [], [], [], [], []
     for word in words:
         expected = find_phrase(scene, word)
         hits = demo_library.search(word).hits
@@ -77,6 +77,7 @@ def test_presence_is_that_of_the_scene_and_counts_and_places_nearly_always(demo_
                 away = np.linalg.norm(np.subtract(one["center"], other["center"]))
                 apart.append(away / max(other["size"]))
                 sizes.append(np.prod(one["size"]) ** (1 / 3) / np.prod(other["size"]) ** (1 / 3))
+                scores.append(abs(one["score"] - other["score"]))
     assert len(words) > 120
     assert len(counts) > 25
     assert np.mean(presences) >= 0.98
@@ -84,6 +85,8 @@ def test_presence_is_that_of_the_scene_and_counts_and_places_nearly_always(demo_
     assert np.median(apart) < 0.05
     assert np.quantile(apart, 0.9) < 0.15
     assert 0.8 < np.quantile(sizes, 0.1) <= np.quantile(sizes, 0.9) < 1.2
+    assert np.median(scores) < 0.006
+    assert np.quantile(scores, 0.9) < 0.03
 
 
 @pytest.mark.parametrize(
