@@ -183,3 +183,11 @@ def test_the_script_adds_files_and_writes_the_page(comparison, tmp_path, monkeyp
     with pytest.raises(SystemExit):
         run("--add", source)
     assert "--name" in capsys.readouterr().err
+
+
+def test_the_page_has_the_tables_of_the_stored_results_and_they_are_of_one_commit(tmp_path, monkeypatch):
+    page = tmp_path / "results.md"
+    page.write_bytes(tables.PAGE.read_bytes())
+    monkeypatch.setattr(sys, "argv", ["tables.py", "--output", str(page)])
+    tables.main()
+    assert page.read_text(encoding="utf-8") == tables.PAGE.read_text(encoding="utf-8")

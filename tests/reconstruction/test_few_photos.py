@@ -21,7 +21,8 @@ def test_an_added_point_has_the_depth_of_the_nearest_known_point_in_its_photo_an
     monkeypatch.setattr(few_photos, "PIXELS_A_POINT", 2)
     name = capture.train_names[2]
     camera, photo = capture.views[name].camera, capture.views[name].load_image()
-    found = points_between(dataclasses.replace(capture, train_names=(name,)), points)
+    one = dataclasses.replace(capture, train_names=(name,))
+    found = points_between(one, points, enough=camera.width * camera.height)
     known = len(points.points)
     np.testing.assert_array_equal(found.points[:known], points.points)
     assert len(found.points) == camera.width * camera.height // 2
