@@ -98,8 +98,7 @@ def whole_things(chosen: Selection, hidden: Tensor, segments: Segments | None) -
     if segments is None or not chosen:
         return chosen
     shown = _with_borders(chosen, segments)
-    inner = _beside(shown, hidden) & inside_hulls(shown, hidden)
-    return replace(shown, mask=shown.mask | inner)
+    return replace(shown, mask=shown.mask | inside_hulls(shown, _beside(shown, hidden)))
 
 
 @torch.no_grad()
@@ -136,20 +135,21 @@ def _beside(chosen: Selection, hidden: Tensor) -> Tensor:
     return torch.from_numpy(found).to(chosen.mask.device)
 
 
-def inside_hulls(chosen: Selection, hidden: Tensor) -> Tensor:
-    """The hidden Gaussians inside the instances of a selection ``[N]`` bool."""
-    means, inside = chosen.gaussians.means.detach().cpu().double().numpy(), np.zeros(len(chosen.mask), bool)
+def inside_hulls(chosen: Selection, among: Tensor) -> Tensor:
+    """Which of some Gaussians lie inside the instances of a selection ``[N]`` bool."""
+    means, found = chosen.gaussians.means.detach().cpu().double().numpy(), among.cpu().numpy().copy()
+    places, inside = means[found], np.zeros(int(found.sum()), bool)
     for each in chosen.instances:
-        inside |= inside_hull(means, each.mask.cpu().numpy())
-    return torch.from_numpy(inside).to(hidden.device) & hidden
+        inside |= inside_hull(means[each.mask.cpu().numpy()], places)
+    found[found] = inside
+    return torch.from_numpy(found).to(among.device)
 
 
-def inside_hull(means: NDArray[np.float64], thing: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which Gaussians lie in the convex hull of a thing, enlarged about its center ``[N]``."""
-    points = means[thing]
+def inside_hull(points: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which places ``[M, 3]`` lie in the convex hull of points ``[K, 3]``, enlarged about its center ``[M]``."""
     try:
         corners = points[ConvexHull(points).vertices] if len(points) > 3 else points
         center = corners.mean(0)
-        return np.asarray(Delaunay(center + _GROWN * (corners - center)).find_simplex(means) >= 0)
+        return np.asarray(Delaunay(center + _GROWN * (corners - center)).find_simplex(places) >= 0)
     except (QhullError, ValueError, IndexError):  # flat or too few
-        return thing.copy()
+        return np.zeros(len(places), bool)

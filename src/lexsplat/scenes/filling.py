@@ -191,7 +191,8 @@ def _fill_below(thing: Selection, gone: Mask, cameras: Sequence[Camera]) -> Fill
 def _stuffing(gaussians: Gaussians, own: Mask, gone: Mask, cameras: Sequence[Camera]) -> Mask:
     """The Gaussians ``[N]`` within a thing's hull that hardly any view sees, because the thing hides them."""
     means = gaussians.means.detach().cpu().double().numpy()
-    places = np.flatnonzero(inside_hull(means, own) & ~gone)
+    places = np.flatnonzero(~gone)
+    places = places[inside_hull(means[own], means[places])]
     found = np.zeros(len(gone), bool)
     if len(places) and cameras:
         _, covered, _ = looked_up(gaussians, gone, means[places], cameras, 0.0)
