@@ -22,7 +22,7 @@ import numpy as np
 from support.forks import outcome
 
 KILLS_A_SCENE = 4
-LONGEST_SECONDS = 0.8
+LONGEST_SECONDS = 0.4
 """Maximum delay in seconds of the kills at random moments."""
 
 

@@ -12,9 +12,9 @@ def on_sphere(center, radius: float, count: int, seed: int) -> np.ndarray:
 
 def on_table(seed: int = 0) -> np.ndarray:
     """Three balls on a square table top at z = 0."""
-    floor = np.random.default_rng(seed).uniform(-1, 1, (4000, 3)) * [1.5, 1.5, 0.002]
+    floor = np.random.default_rng(seed).uniform(-1, 1, (2400, 3)) * [1.5, 1.5, 0.002]
     balls = [
-        on_sphere((x, y, r), r, 1200, seed + 1)
+        on_sphere((x, y, r), r, 700, seed + 1)
         for x, y, r in ((0, 0, 0.4), (0.8, 0.3, 0.3), (-0.7, 0.5, 0.35))
     ]
     return np.concatenate([floor, *balls])
