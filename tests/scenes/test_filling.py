@@ -93,16 +93,55 @@ def test_a_moved_thing_leaves_the_surface_that_a_deleted_one_leaves(tmp_path):
     assert len(kept.scene.gaussians) == len(scene.gaussians)
 
 
-@pytest.mark.parametrize("broken", ["####", None, 5, ""])
-def test_damaged_remains_of_a_moved_thing_are_reported_in_one_line(tmp_path, broken):
+def test_a_thing_that_stands_on_a_deleted_one_stays_whole():
+    side, edge = np.linspace(-1.5, 1.5, 90), np.linspace(-0.1, 0.1, 9)
+    plane = np.stack(np.meshgrid(side, side, [0.0]), -1).reshape(-1, 3)
+    on_cloth = np.abs(plane[:, :2]).max(1) < 0.6
+    block = np.stack(np.meshgrid(edge, edge, np.linspace(0.04, 0.24, 9)), -1).reshape(-1, 3)
+    points = np.concatenate([plane[~on_cloth], block, plane[on_cloth] + [0, 0, 0.02]])
+    scene = solid(points, np.full_like(points, 0.5), int(on_cloth.sum()))
+    editor = Editor(scene)
+    editor.delete(box_of(scene))
+    assert str(editor.steps[0]).find("filled") > 0
+    assert int((editor.scene.gaussians.means[:, 2] > 0.03).sum()) == len(block)
+
+
+@pytest.mark.parametrize("undone", [False, True])
+@pytest.mark.parametrize("broken", ["####", None, 5, "", "the mask"])
+def test_damaged_remains_of_a_moved_thing_are_reported_in_one_line(tmp_path, broken, undone):
     scene, world = table_with_a_ball()
     journal = tmp_path / "edits.jsonl"
     Editor(scene, journal).move(ball_of(scene, world), Motion(translation=(1.0, 0, 0)))
     header, line = journal.read_text().splitlines()
-    journal.write_text(f"{header}\n{json.dumps({**json.loads(line), 'remains': broken})}\n")
+    step = json.loads(line)
+    changed = json.dumps({**step, "remains": step["mask"] if broken == "the mask" else broken})
+    journal.write_text(f"{header}\n{changed}\n" + ('{"undo": true}\n' if undone else ""))
     with pytest.raises(FileFormatError) as error:
         Editor(scene, journal)
     assert "\n" not in str(error.value)
+
+
+def test_an_undone_step_that_cannot_be_replayed_is_reported_in_one_line(tmp_path):
+    scene, world = table_with_a_ball()
+    journal = tmp_path / "edits.jsonl"
+    Editor(scene, journal).move(ball_of(scene, world), Motion(translation=(1.0, 0, 0)))
+    header, line = journal.read_text().splitlines()
+    journal.write_text(f'{header}\n{json.dumps({**json.loads(line), "scale": -1})}\n{{"undo": true}}\n')
+    editor = Editor(scene, journal)
+    with pytest.raises(FileFormatError, match="replayed"):
+        editor.redo()
+    assert torch.equal(editor.scene.gaussians.means, scene.gaussians.means)
+    assert len(editor.undone) == 1
+
+
+def test_numbers_that_a_step_does_not_have_are_ignored_and_phrases_are_one_line(tmp_path):
+    scene, world = table_with_a_ball()
+    journal = tmp_path / "edits.jsonl"
+    Editor(scene, journal).recolor(ball_of(scene, world), (0.1, 0.2, 0.3))
+    header, line = journal.read_text().splitlines()
+    changed = {**json.loads(line), "fill": "none", "remains": 3, "phrase": "a\nball\x1b[31m"}
+    journal.write_text(f"{header}\n{json.dumps(changed)}\n")
+    assert str(Editor(scene, journal).steps[0]) == "recolor a ball [31m (600 Gaussians)"
 
 
 def test_nothing_is_filled_where_a_thing_stands_on_nothing_or_a_fill_is_not_wanted():

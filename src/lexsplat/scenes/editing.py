@@ -170,15 +170,8 @@ class Editor:
         self.scene = scene
         if self.journal is not None and self.journal.path.exists():
             self.steps, self.undone = self.journal.read()
-            try:
+            with self._replayable():
                 self._replay()
-            except (KeyError, TypeError, ValueError, OverflowError) as error:
-                raise FileFormatError(
-                    self.journal.path,
-                    expected="steps that can be replayed",
-                    found=repr(error)[:200],
-                    remedy="discard the edit",
-                ) from error
 
     # -- steps
 
@@ -233,7 +226,7 @@ class Editor:
         """Redo the last undone step; False if there is none."""
         if not self.undone:
             return False
-        with self._change({"redo": True}):
+        with self._change({"redo": True}), self._replayable():
             self._advance(self.undone.pop())
         return True
 
@@ -294,16 +287,17 @@ class Editor:
                 remedy="try other words or a lower threshold",
             )
         mask = self.planned_mask(kind, chosen)
+        gone = self.planned_mask("delete", chosen) if kind in ("delete", "move") else mask
         if fill:
-            taken = replace(chosen, mask=self.planned_mask("delete", chosen), parts=())
             cameras = [view.camera for view in self.original.views.values() if view.split == "train"]
-            found, gone = fill_for(taken, cameras, self.original.listener)
+            things = replace(chosen, mask=gone, parts=())
+            found, gone = fill_for(things, cameras, self.original.listener, self.scene.hidden)
             if found is not None:
                 values["fill"] = found.to_json()
-            if kind == "move":
-                values["remains"] = packed(gone & ~mask)
-            else:
-                mask = gone
+        if kind == "move":
+            values["remains"] = packed(gone & ~mask)
+        else:
+            mask = gone
         step = Step(kind, mask.clone().cpu(), values, chosen.phrase)
         with self._change(step.to_json()):
             self._advance(step)
@@ -321,6 +315,19 @@ class Editor:
         except BaseException:
             self.scene, self.steps, self.undone = before
             raise
+
+    @contextmanager
+    def _replayable(self) -> Iterator[None]:
+        """Errors of steps that come from the journal."""
+        try:
+            yield
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise FileFormatError(
+                self.journal.path if self.journal else "edit",
+                expected="steps that can be replayed",
+                found=repr(error)[:200],
+                remedy="discard the edit",
+            ) from error
 
     def _advance(self, step: Step) -> None:
         if len(self.scene.gaussians) > MAX_GROWTH * max(len(self.original.gaussians), 1):

@@ -53,6 +53,8 @@ _STUFFED = 0.5
 """Share of the views in which the thing hides a Gaussian within its hull, above which that is deleted too."""
 _BORDER, _OVERLAP, _RIM = 3, 4, 3
 """Pixels around such places in which Gaussians are deleted, the fill overlaps the rest, and colors do not count."""
+_NEAR = 8
+"""Gaussians of a thing, nearest from above, that tell its height at a place."""
 _BARE = 0.6
 """Coverage below which a pixel is bare."""
 _UNSEEN = 0.3
@@ -127,7 +129,10 @@ class Fill(NamedTuple):
 
 
 def fill_for(
-    chosen: Selection, cameras: Sequence[Camera] = (), listener: Listener = silent
+    chosen: Selection,
+    cameras: Sequence[Camera] = (),
+    listener: Listener = silent,
+    hidden: Tensor | None = None,
 ) -> tuple[Fill | None, Tensor]:
     """The Gaussians that close the surfaces under a deleted selection, and those that are deleted with it.
 
@@ -135,16 +140,18 @@ def fill_for(
         chosen: The selection.
         cameras: The views that the scene was made from.
         listener: Receives events of stage "fill", one unit a thing.
+        hidden: Which Gaussians are hidden ``[N]`` bool; others that stand on a thing stay. None takes all as hidden.
 
     Returns:
         The fill, None if there is nothing to fill, and the selection with the remains under its things ``[N]`` bool.
     """
     gone = chosen.mask.cpu().numpy().copy()
+    shown = np.zeros_like(gone) if hidden is None else ~hidden.cpu().numpy()
     things, found = chosen.instances, list[Fill]()
     try:
         for done, thing in enumerate(things):
             listener(Event("fill", done, len(things)))
-            fill = _fill_below(thing, gone, cameras)
+            fill = _fill_below(thing, gone, shown, cameras)
             found += [] if fill is None else [fill]
     finally:  # a viewer goes on after an error, and its bar ends
         listener(Event("fill", len(things), len(things)))
@@ -154,8 +161,11 @@ def fill_for(
     return Fill(*(np.concatenate(rows)[:_MOST] for rows in zip(*found))), mask
 
 
-def _fill_below(thing: Selection, gone: Mask, cameras: Sequence[Camera]) -> Fill | None:
-    """The Gaussians that close the surface under one thing; remains there are added to ``gone [N]``."""
+def _fill_below(thing: Selection, gone: Mask, shown: Mask, cameras: Sequence[Camera]) -> Fill | None:
+    """The Gaussians that close the surface under one thing; remains there are added to ``gone [N]``.
+
+    Those that are shown and stand on the thing are no remains: things on a cloth, on a table.
+    """
     gaussians = thing.gaussians
     means = gaussians.means.detach().cpu().double().numpy()
     own, solid = thing.mask.cpu().numpy(), gaussians.opacities.detach().cpu().numpy() >= _FAINT
@@ -167,7 +177,9 @@ def _fill_below(thing: Selection, gone: Mask, cameras: Sequence[Camera]) -> Fill
     photo = photographed(gaussians, gone, surface, flat, cameras)
     unseen = binary_dilation(photo.covered > _HIDDEN, iterations=_BORDER)
     inside = _at(unseen, local[:, :2], photo) & (np.abs(local[:, 2]) <= THICK * surface.radius)
-    inside |= _stuffing(gaussians, own, gone | inside, cameras)
+    inside &= ~_standing(local, own & solid, inside & shown)
+    stuffing = _stuffing(gaussians, own, gone | inside, cameras)
+    inside |= stuffing & ~_standing(local, own & solid, stuffing & shown)
     _, coverage, heights = from_above(gaussians, surface, flat & ~inside, photo.cells)
     near = below(local[own & (local[:, 2] <= 2 * surface.radius), :2], photo.cells)
     filled = binary_dilation(unseen, iterations=_OVERLAP)
@@ -186,6 +198,17 @@ def _fill_below(thing: Selection, gone: Mask, cameras: Sequence[Camera]) -> Fill
     same = np.tile([w, x, y, z, *np.log(photo.size * np.array(_SIZES))], (len(painted), 1))
     disks = np.concatenate([surface.origin + places @ surface.axes, same, painted], 1).astype("<f4")
     return Fill(members[nearest].astype("<i4"), disks)
+
+
+def _standing(local: FloatArray, thing: Mask, among: Mask) -> Mask:
+    """Which of some Gaussians are higher than a thing is at their place ``[N]``, in coordinates of the surface."""
+    found, places = among.copy(), np.flatnonzero(among)
+    if len(places) and thing.any():
+        body = local[thing]
+        near = min(_NEAR, len(body))
+        _, nearest = cKDTree(body[:, :2]).query(local[places, :2], k=range(1, near + 1))
+        found[places] = local[places, 2] > np.median(body[nearest, 2], axis=1)
+    return found
 
 
 def _stuffing(gaussians: Gaussians, own: Mask, gone: Mask, cameras: Sequence[Camera]) -> Mask:

@@ -10,19 +10,29 @@ import os
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from lexsplat.runtime.errors import FileFormatError, SceneFolderError
+from lexsplat.scenes.filling import Fill
 from lexsplat.scenes.scene import Scene
 
 Kind = Literal["delete", "keep", "recolor", "move", "duplicate"]
 JOURNAL_VERSION = 1
 _DEFLATE = 1032
 """Largest compression ratio of DEFLATE."""
+_MOTION = ("rotation", "scale", "translation", "center")
+_VALUES: dict[Kind, tuple[str, ...]] = {
+    "delete": ("fill",),
+    "keep": (),
+    "recolor": ("color", "strength"),
+    "move": (*_MOTION, "fill", "remains"),
+    "duplicate": _MOTION,
+}
+"""The numbers of each kind of step."""
 _RENAMED_KINDS = {"recolour": "recolor"}
 """Steps of journals that were written before the renames, and their present names."""
 
@@ -70,13 +80,17 @@ class Step:
         try:
             kind = _RENAMED_KINDS.get(data["step"], data["step"])
             mask = unpacked(data["mask"], data["gaussians"])
+            if kind not in _VALUES:
+                raise ValueError(f"not a step: {kind!r}"[:100])
         except (KeyError, TypeError) as error:
-            raise ValueError(f"not a step: {error!r}") from error
-        if kind not in get_args(Kind):
-            raise ValueError(f"not a step: {kind!r}")
-        known = ("color", "strength", "rotation", "scale", "translation", "center", "fill", "remains")
-        values = {name: data[name] for name in known if name in data}
-        return cls(kind, mask, values, str(data.get("phrase", "")))
+            raise ValueError(f"not a step: {error!r}"[:100]) from error
+        values = {name: data[name] for name in _VALUES[kind] if name in data}
+        if "fill" in values:
+            Fill.from_json(values["fill"])
+        if "remains" in values and bool((unpacked(values["remains"], len(mask)) & mask).any()):
+            raise ValueError("not a step: what is moved remains")
+        phrase = "".join(c if c.isprintable() else " " for c in str(data.get("phrase", "")))
+        return cls(kind, mask, values, phrase)
 
 
 def packed(mask: Tensor) -> str:
