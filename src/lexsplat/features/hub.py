@@ -138,7 +138,7 @@ def _vocabulary(folder: Path) -> list[Path]:
 
 def loaded_files(folder: Path, tower: str) -> list[Path]:
     """The files of a model folder on which its output depends, sorted."""
-    settings = [path for name in _PREPROCESSING if (path := folder / name).is_file()][:1]
+    settings = [] if (path := preprocessing_file(folder)) is None else [path]
     if tower == "clip":
         tokenizer = [path for name in _TOKENIZER_SETTINGS if (path := folder / name).is_file()]
         settings += [*_vocabulary(folder), *tokenizer]
@@ -152,12 +152,15 @@ def preprocessing(folder: Path) -> dict[str, Any]:
     Raises:
         ModelError: If the file is damaged.
     """
-    for name in _PREPROCESSING:
-        if (folder / name).is_file():
-            content = read_config(folder / name)
-            inner = content.get("image_processor", content)
-            return inner if isinstance(inner, dict) else {}
-    return {}
+    path = preprocessing_file(folder)
+    content = {} if path is None else read_config(path)
+    inner = content.get("image_processor", content)
+    return inner if isinstance(inner, dict) else {}
+
+
+def preprocessing_file(folder: Path) -> Path | None:
+    """The file with the settings of the image preprocessor; None if there is none."""
+    return next((path for name in _PREPROCESSING if (path := folder / name).is_file()), None)
 
 
 def read_config(path: Path) -> dict[str, Any]:

@@ -1,0 +1,106 @@
+"""Model folders with a damaged file: one line names the file, and nothing is left behind."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from support.encoder_folders import save_model, seeded, tiny_vit
+from support.refusals import assert_reports
+
+from lexsplat import cli
+from lexsplat.features.encoders import load_clip, load_dino
+from lexsplat.runtime.errors import ModelError
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
+
+HUGE = int("9" * 400)
+
+
+@pytest.fixture
+def clip_copy(clip_folder, tmp_path) -> Path:
+    """A copy of the tiny CLIP to damage."""
+    return shutil.copytree(clip_folder, tmp_path / "copy")
+
+
+@pytest.fixture(scope="module")
+def vit_folder(tmp_path_factory) -> Path:
+    return save_model(seeded(tiny_vit), tmp_path_factory.mktemp("vit"))
+
+
+def refused(folder: Path, *parts: str, load=load_clip) -> str:
+    with pytest.raises(ModelError) as caught:
+        load(str(folder))
+    assert_reports(caught.value, *parts)
+    return str(caught.value)
+
+
+# -- the image preprocessor
+
+
+@pytest.mark.parametrize(
+    ("mean", "found"),
+    [
+        (None, "found null"),
+        (0.5, "found 0.5"),
+        ("0.5", 'found "0.5"'),
+        ([0.5, 0.5], "found [0.5, 0.5]"),
+        ([0.5, None, 0.5], "found [0.5, null, 0.5]"),
+        ([True, True, True], "found [true, true, true]"),
+        ([0.5, 0.5, float("nan")], "found [0.5, 0.5, NaN]"),
+        ([[0.5, 0.5, 0.5]], "found [[0.5, 0.5, 0.5]]"),
+        ([0.5, 0.5, HUGE], "found [0.5, 0.5, 999"),
+        ([0.5, 0.5, 1e300], "found [0.5, 0.5, 1e+300]"),
+        ([0.5] * 1000, "..."),
+    ],
+)
+def test_an_image_mean_that_is_not_three_numbers_is_refused(vit_folder, tmp_path, mean, found):
+    folder = shutil.copytree(vit_folder, tmp_path / "vit")
+    path = folder / "preprocessor_config.json"
+    path.write_text(json.dumps({"image_mean": mean, "image_std": [0.5, 0.5, 0.5]}))
+    expected = f"{path}: image_mean: expected three finite numbers, "
+    message = refused(folder, expected, found, "fetch the model again", load=load_dino)
+    assert len(message) < len(expected) + 250
+
+
+@pytest.mark.parametrize("std", [None, 1, [0.5, 0.5, 0], [0.5, 0.5, -0.5], [0.5, 0.5, 1e-300]])
+def test_an_image_deviation_that_is_not_three_positive_numbers_is_refused(vit_folder, tmp_path, std):
+    folder = shutil.copytree(vit_folder, tmp_path / "vit")
+    (folder / "preprocessor_config.json").unlink()
+    content = {"image_processor": {"image_mean": [0.5, 0.5, 0.5], "image_std": std}}
+    (folder / "processor_config.json").write_text(json.dumps(content))
+    expected = "processor_config.json: image_std: expected three finite numbers above 0"
+    refused(folder, expected, f"found {json.dumps(std)}", load=load_dino)
+
+
+def test_whole_numbers_are_numbers_and_other_entries_are_not_read(vit_folder, tmp_path):
+    folder = shutil.copytree(vit_folder, tmp_path / "vit")
+    content = {"image_mean": [0, 0, 0], "image_std": [1, 1, 1]}
+    content |= {"size": None, "crop_size": "large", "rescale_factor": [], "resample": {}}
+    (folder / "preprocessor_config.json").write_text(json.dumps(content))
+    encoder = load_dino(str(folder))
+    assert encoder._mean.flatten().tolist() == [0, 0, 0]
+    assert encoder._std.flatten().tolist() == [1, 1, 1]
+    assert encoder.encode_dense(torch.rand(3, 32, 32), short_side=32).isfinite().all()
+
+
+def test_a_damaged_preprocessor_is_refused_by_each_command_and_leaves_no_folder(
+    clip_copy, vit_folder, tiny_capture, tmp_path, capsys
+):
+    dino, output = shutil.copytree(vit_folder, tmp_path / "vit"), tmp_path / "new" / "scene"
+    for folder in (clip_copy, dino):
+        (folder / "preprocessor_config.json").write_text('{"image_mean": null, "image_std": null}')
+    build = ["build", str(tiny_capture), "--output", str(output), "--device", "cpu"]
+    for words in (
+        ["encoders", "--clip", str(clip_copy)],
+        ["encoders", "--clip", "bundled", "--dino", str(dino)],
+        [*build, "--clip", str(clip_copy), "--dino", "none"],
+    ):
+        assert cli.main(words) == 1
+        error = capsys.readouterr().err.splitlines()[-1]
+        assert error.startswith("error: ")
+        assert "preprocessor_config.json: image_mean: expected three finite numbers, found null" in error
+    assert not output.parent.exists()
