@@ -104,3 +104,41 @@ def test_a_damaged_preprocessor_is_refused_by_each_command_and_leaves_no_folder(
         assert error.startswith("error: ")
         assert "preprocessor_config.json: image_mean: expected three finite numbers, found null" in error
     assert not output.parent.exists()
+
+
+# -- pickled weights
+
+
+def pickled(folder: Path, content: bytes | dict) -> Path:
+    """Replace the weights of a folder by a pickled file."""
+    (folder / "model.safetensors").unlink()
+    path = folder / "pytorch_model.bin"
+    if isinstance(content, dict):
+        torch.save(content, path)
+    else:
+        path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"\x80\x04\x95" + b"garbage" * 9, "a damaged file"),
+        (b"\x80\x02" + b"\xff" * 50, "a damaged file"),
+        (b"hello world", "a damaged file"),
+        (b"PK\x03\x04" + b"x" * 90, "a damaged file"),
+        (b"", "an empty file"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 598641023\n", "a pointer of Git LFS"),
+        ({"weight": Path("a")}, "other objects"),
+        ({"weight": 3}, "other objects"),
+        ({1: torch.ones(3)}, "other objects"),
+    ],
+)  # fmt: skip
+def test_pickled_weights_that_are_not_tensors_are_refused_in_words_of_lexsplat(
+    clip_copy, content, found, recwarn
+):
+    path = pickled(clip_copy, content)
+    expected = "pytorch_model.bin: expected a pickled dictionary of tensors only, "
+    message = refused(clip_copy, f"{expected}found {found}; ", str(path.parent))
+    assert "PyTorch" not in message
+    assert not [one for one in recwarn if "pickle" in str(one.message)]
