@@ -398,7 +398,11 @@ def _refusal(name: str, tower: str, error: Exception, cache: Path, lacking: str)
     elif isinstance(error, hub.HfHubHTTPError):
         status = getattr(getattr(error, "response", None), "status_code", None)
         found = f"the hub responded with {status or 'an error'}"
+    expected = "a downloaded model"
+    remedy = f"connect to the internet and run again (it is downloaded once); or {_choices(tower)}"
     if lacking:
         found = f"a copy in {cache} without {lacking}; {found.removeprefix('no local copy, and ')}"
-    remedy = f"connect to the internet and run again (it is downloaded once); or {_choices(tower)}"
-    return refuse("a downloaded model", found, remedy)
+    elif name not in PINNED:  # OWNER/NAME may as well be a path
+        found = f"no such folder, {'' if found.startswith('no ') else 'and '}{found}"
+        expected, remedy = f"a model folder or {expected}", f"check the path, or {remedy}"
+    return refuse(expected, found, remedy)
