@@ -13,6 +13,7 @@ from support.refusals import assert_reports
 
 from lexsplat import cli
 from lexsplat.features.encoders import load_clip, load_dino
+from lexsplat.features.text import load_text
 from lexsplat.runtime.errors import ModelError
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
@@ -142,3 +143,40 @@ def test_pickled_weights_that_are_not_tensors_are_refused_in_words_of_lexsplat(
     message = refused(clip_copy, f"{expected}found {found}; ", str(path.parent))
     assert "PyTorch" not in message
     assert not [one for one in recwarn if "pickle" in str(one.message)]
+
+
+# -- configuration and tokenizer
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        ("", "Expecting value"),
+        ("[]", "a list"),
+        ("null", "null"),
+        ("{}", "no model_type"),
+        ('{"model_type": 3}', "no model_type"),
+    ],
+)
+def test_a_damaged_configuration_is_refused_by_its_name(clip_copy, vit_folder, tmp_path, content, found):
+    vit = shutil.copytree(vit_folder, tmp_path / "vit")
+    for folder, load in ((clip_copy, load_clip), (clip_copy, load_text), (vit, load_dino)):
+        path = folder / "config.json"
+        path.write_text(content)
+        expected = f"{path}: expected a model configuration in JSON, found {found}"
+        refused(folder, expected, "fetch the model again", load=load)
+
+
+@pytest.mark.parametrize("name", ["tokenizer.json", "tokenizer_config.json", "special_tokens_map.json"])
+@pytest.mark.parametrize(("content", "found"), [("", "Expecting value"), ("[]", "a list"), ("null", "null")])
+def test_a_damaged_file_of_the_tokenizer_is_refused_by_its_name(clip_copy, name, content, found):
+    (clip_copy / name).write_text(content)
+    expected = f"{clip_copy / name}: expected a tokenizer in JSON, found {found}"
+    refused(clip_copy, expected, "fetch the model again")
+
+
+@pytest.mark.parametrize("content", ["{}", '{"added_tokens": 3}', '{"model": []}'])
+def test_json_that_is_no_tokenizer_is_refused_by_its_name(clip_copy, content):
+    (clip_copy / "tokenizer.json").write_text(content)
+    message = refused(clip_copy, f"{clip_copy / 'tokenizer.json'}: expected a tokenizer, found other content")
+    assert "added_tokens'" not in message

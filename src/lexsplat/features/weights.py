@@ -1,4 +1,4 @@
-"""Weights of a model folder: which files are read, and their tensors under the names of transformers."""
+"""Weights and JSON of a model folder: which files are read, and tensors under the names of transformers."""
 
 from __future__ import annotations
 
@@ -200,6 +200,30 @@ def _renamed(key: str, patterns: Iterable[tuple[str, str]]) -> str:
     return key
 
 
+def read_config(path: Path, what: str) -> dict[str, Any]:
+    """A JSON object of a model folder.
+
+    Args:
+        path: The file.
+        what: Its content, such as "a tokenizer", for messages.
+
+    Raises:
+        ModelError: If the file is not a JSON object.
+    """
+    try:
+        content = read_json(path)
+    except FileFormatError as error:
+        raise _no_json(path, what, error.found[:200]) from error
+    if not isinstance(content, dict):
+        kinds = {list: "a list", str: "a text", type(None): "null"}
+        raise _no_json(path, what, kinds.get(type(content), f"{content}"[:20]))
+    return content
+
+
+def _no_json(path: Path, what: str, found: str) -> ModelError:
+    return ModelError(path, expected=f"{what} in JSON", found=found, remedy="fetch the model again")
+
+
 def build_model(folder: Path, name: str, spare: str) -> Any:
     """The model of transformers that a folder describes, with all its weights.
 
@@ -214,6 +238,8 @@ def build_model(folder: Path, name: str, spare: str) -> Any:
     """
     from transformers import AutoConfig, AutoModel
 
+    what = "a model configuration"
+    kind_of_model = read_config(folder / "config.json", what).get("model_type")
     state = load_weights(folder, name)
     try:
         config = AutoConfig.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
@@ -229,6 +255,8 @@ def build_model(folder: Path, name: str, spare: str) -> Any:
             None, config=config, state_dict=state, output_loading_info=True, ignore_mismatched_sizes=True
         )
     except Exception as error:  # KeyError, OSError, ValueError, RuntimeError ...
+        if not isinstance(kind_of_model, str):  # transformers may do without, by the name of the folder
+            raise _no_json(folder / "config.json", what, "no model_type") from error
         raise ModelError(
             f"model {name}",
             expected="a model that transformers can load",
