@@ -167,3 +167,5 @@ def test_times_are_reported_in_their_unit():
         .describe(100)
         .endswith("about 1.5 min a photo; 2:30:00 hours for 100 training photos")
     )
+    assert Estimate(9, 0.04).describe(3).endswith("about 0.0 s a photo; 0.1 s for 3 training photos")
+    assert Estimate(9, 1.44).describe(1).endswith("about 1.4 s a photo; 1.4 s for 1 training photo")

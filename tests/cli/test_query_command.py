@@ -97,3 +97,16 @@ def test_an_empty_prompt_is_refused(built, capsys):
 
 def test_an_unknown_view_is_refused_with_the_names_of_views(built, capsys):
     fails_in_one_line(capsys, ["query", str(built), "x", "--view", "nowhere"], "nowhere", "view_01.png")
+
+
+def test_a_long_prompt_is_shortened_for_display_and_whole_in_json(capsys):
+    prompt = " ".join(["apple"] * 90)
+    for command in (["find", "demo", prompt], ["query", "demo", prompt, "--no-images"]):
+        assert cli.main(command) == 0
+        printed = capsys.readouterr().out
+        assert printed.startswith(f"{prompt[:60]}...: ")
+        assert max(map(len, printed.splitlines())) < 400
+    assert cli.main(["find", "demo", prompt, "--json"]) == 0
+    (answer,) = json.loads(capsys.readouterr().out)["phrases"]
+    assert answer["phrase"] == prompt
+    assert answer["understood"] == f'"{prompt}"'

@@ -177,6 +177,23 @@ def test_a_missing_network_leaves_three_remedies(fake, load):
     refused("someone/model", "go without (`--dino none`)", load=load_dino)
 
 
+def test_a_name_that_may_be_a_missing_folder_is_reported_as_both(fake):
+    fake.error = ConnectionError("no route")
+    refused(
+        "model enc/ok: expected a model folder or a downloaded model",
+        "found no such folder, no local copy, and the hub cannot be reached (ConnectionError)",
+        "; check the path, or connect to the internet",
+        name="enc/ok",
+    )
+    fake.error = errors.OfflineModeIsEnabled("offline")
+    refused("found no such folder, no local copy, and HF_HUB_OFFLINE is set", name="enc/ok")
+    fake.error = hub_error(errors.HfHubHTTPError, 503)
+    refused("found no such folder, and the hub responded with 503", name="enc/ok")
+    with pytest.raises(ModelError) as caught:
+        load_clip(DEFAULT_CLIP)
+    assert "folder," not in str(caught.value).split(";")[0], "a default is no path"
+
+
 def test_each_cause_has_its_own_message(fake):
     fake.error = hub_error(errors.RepositoryNotFoundError, 404)
     refused("no such folder and no such model", "check the spelling")

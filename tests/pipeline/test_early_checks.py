@@ -176,13 +176,13 @@ def test_the_time_of_the_features_is_reported_first(clip_folder, tmp_path, caplo
     config = replace(CONFIG, clip=str(clip_folder)).resolved("cpu", (400, 300))
     with caplog.at_level(NOTE, logger="lexsplat"):
         events = []
-        check_encoders(config, tmp_path, 50, (400, 300), events.append)
+        check_encoders(config, tmp_path, 5_000, (400, 300), events.append)
     assert [(event.stage, event.done, event.total) for event in events] == [
         ("encoders", done, 4) for done in range(5)
     ]
     # The encoder has patches. Crops of 46 pixels every 27.6 or less: 14 x 11.
     assert "features on cpu: 154 crops and about" in caplog.text
-    assert "for 50 training photos" in caplog.text
+    assert "for 5,000 training photos" in caplog.text
     assert "words match bundled images by" in caplog.text, "random weights match no words"
 
 

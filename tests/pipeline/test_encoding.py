@@ -7,6 +7,7 @@ import torch
 
 from lexsplat.captures import load_capture
 from lexsplat.features import FeatureConfig
+from lexsplat.features.estimate import Estimate
 from lexsplat.pipeline import encoding
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps
@@ -80,6 +81,7 @@ def test_the_time_of_the_features_is_told_once_if_no_check_has_told_it(
     tiny_capture, tmp_path, monkeypatch, caplog
 ):
     monkeypatch.setattr(encoding, "_TOLD_FROM", 1)
+    monkeypatch.setattr(encoding, "estimate", lambda *_: Estimate(7, 1.0))
     capture = load_capture(tiny_capture)
     small = FeatureConfig(crop_sizes=(0.5,), crop_strides=(0.5,), map_cells=8, max_short_side=24)
     config = BuildConfig(clip="bundled", dino="none", features=small).resolved("cpu", (96, 72))
@@ -89,3 +91,15 @@ def test_the_time_of_the_features_is_told_once_if_no_check_has_told_it(
         with caplog.at_level(NOTE, logger="lexsplat"):
             feature_maps(capture, config, Encoders.of(config), tmp_path)
         assert sum(told in message for message in caplog.messages) == expected
+
+
+@pytest.mark.parametrize(("seconds", "expected"), [(1.9, 0), (2.0, 1)])
+def test_a_forecast_of_less_than_two_seconds_is_left_out(
+    clip_folder, tmp_path, monkeypatch, caplog, seconds, expected
+):
+    monkeypatch.setattr(encoding, "estimate", lambda *_: Estimate(7, seconds / 3))
+    config = BuildConfig(clip=str(clip_folder), dino="none").resolved("cpu", (96, 72))
+    with caplog.at_level(NOTE, logger="lexsplat"):
+        encoders = check_encoders(config, tmp_path, 3)
+    assert sum("for 3 training photos" in message for message in caplog.messages) == expected
+    assert encoders.told, "the extraction does not measure it again"

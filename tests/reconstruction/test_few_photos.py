@@ -94,6 +94,14 @@ def test_a_warning_states_how_well_held_out_photos_are_rendered(capture, caplog)
     ]
     assert f"{len(found)} held-out photos are rendered at {np.mean(found):.1f} dB" in record.getMessage()
     caplog.clear()
+    one = dataclasses.replace(capture, test_names=capture.test_names[:1])
+    few_photos.warn_of_few_photos(one, gaussians)
+    assert ": 1 held-out photo is rendered at " in caplog.text
+    caplog.clear()
+    one = dataclasses.replace(capture, test_names=(), train_names=capture.train_names[:1])
+    few_photos.warn_of_few_photos(one, gaussians)
+    assert "1 training photo is few; " in caplog.text
+    caplog.clear()
     reconstruct(dataclasses.replace(capture, test_names=()), SHORT)
     assert "dB" not in caplog.text
     assert "are few" in caplog.text

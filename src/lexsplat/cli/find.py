@@ -64,15 +64,18 @@ class Find:
 
 
 def _print_answer(answer: dict[str, Any]) -> None:
-    understood = f" (understood as {answer['understood']})"
+    from lexsplat.scenes.serving import shortened
+
+    understood = f" (understood as {shortened(answer['understood'])})"
     note = f"; {answer['note']}" if answer["note"] else ""
-    print(f"{answer['phrase']}: present: {answer['present']}, {answer['count']} found{understood}{note}")
+    phrase = shortened(answer["phrase"], 60)
+    print(f"{phrase}: present: {answer['present']}, {answer['count']} found{understood}{note}")
     for number, thing in enumerate(answer["instances"], start=1):
         center = ", ".join(f"{v:.2f}" for v in thing["center"])
         size = " x ".join(f"{v:.2f}" for v in thing["size"])
         if thing.get("size_meters") is not None:
             size = " x ".join(f"{v:.3f}" for v in thing["size_meters"]) + " m"
         print(
-            f"  {number}. {thing['name']} at ({center}), size {size}, score {thing['score']:.2f}, "
+            f"  {number}. {shortened(thing['name'], 60)} at ({center}), size {size}, score {thing['score']:.2f}, "
             f"{thing['gaussians']} Gaussians, best seen in {thing['best_view']}"
         )

@@ -98,6 +98,7 @@ class Query:
         scene = open_scene(self.scene, self.device, self.clip)
         from lexsplat.scenes.answers import answer_queries, default_views
         from lexsplat.scenes.feature_maps import write_features
+        from lexsplat.scenes.serving import shortened
 
         scene.query = self._changed(scene.query)
         folder = (self.output or _images_folder(scene)) if self.images else None
@@ -110,7 +111,7 @@ class Query:
             return
         for answer in answers["prompts"]:
             print(
-                f"{answer['prompt']}: best {answer['peak']:.2f} in {answer['peak_view']}, "
+                f"{shortened(answer['prompt'], 60)}: best {answer['peak']:.2f} in {answer['peak_view']}, "
                 f"threshold {answer['threshold']:.2f}, {answer['gaussians']} Gaussians"
                 f"{PRESENCE[answer['present']]}"
             )

@@ -22,9 +22,10 @@ from lexsplat.features.clip_text import (
     light_tower,
     warn_truncated,
 )
-from lexsplat.features.hub import local_folder
+from lexsplat.features.hub import local_folder, tokenizer_files
 from lexsplat.features.portable import TextWeights, tokenizer_content
 from lexsplat.features.pretrained import PretrainedModel, check_images, normalization, resize_images
+from lexsplat.features.weights import read_config
 from lexsplat.runtime.errors import ModelError
 
 DEFAULT_CLIP = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
@@ -218,6 +219,8 @@ def _load_tokenizer(folder: Path, name: str, config: Any) -> Any:
         if list(folder.glob("*.model")) and not all(map(_is_installed, ("sentencepiece", "google.protobuf"))):
             found = "one of SentencePiece, which is not installed"
             remedy = 'run: pip install "lexsplat[siglip]"'
+        else:
+            _check_tokenizer_files(folder)
         raise refusal(expected="a tokenizer beside the weights", found=found, remedy=remedy) from error
     tokenizer.padding_side = "right"  # as in training; transformers' default for SigLIP 2 is "left"
     if not is_vocabulary(len(tokenizer), size):
@@ -227,6 +230,26 @@ def _load_tokenizer(folder: Path, name: str, config: Any) -> Any:
             remedy=f"fetch the model again with its tokenizer files; they are read from {folder}",
         )
     return tokenizer
+
+
+def _check_tokenizer_files(folder: Path) -> None:
+    """Name the file for which a tokenizer cannot be loaded.
+
+    Raises:
+        ModelError: If one is damaged.
+    """
+    from tokenizers import Tokenizer
+
+    for path in tokenizer_files(folder):
+        if path.suffix == ".json":
+            read_config(path, "a tokenizer")
+    path = folder / "tokenizer.json"
+    try:
+        if path.is_file():
+            Tokenizer.from_file(str(path))
+    except Exception as error:  # its errors have no type of their own
+        found = f"other content ({str(error)[:120]})"
+        raise ModelError(path, expected="a tokenizer", found=found, remedy="fetch the model again") from error
 
 
 def _is_installed(module: str) -> bool:

@@ -16,8 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.features.hub import content_hash, read_config
-from lexsplat.features.weights import load_weights
+from lexsplat.features.hub import content_hash
+from lexsplat.features.weights import load_weights, read_config
 
 log = logging.getLogger("lexsplat")
 
@@ -65,7 +65,7 @@ def light_tower(
     """
     if not (folder / "tokenizer.json").is_file():
         return None
-    config = read_config(folder / "config.json")
+    config = read_config(folder / "config.json", "a model configuration")
     given = config.get("text_config") or config.get("text_config_dict") or {}
     if config.get("model_type") != "clip" or not isinstance(given, dict):
         return None

@@ -16,7 +16,7 @@ from lexsplat.features.pretrained import resize_images
 from lexsplat.features.pyramid import cut_crops, encode_stream, unique_boxes
 from lexsplat.features.settings import FeatureConfig
 from lexsplat.runtime.device import torch_threads
-from lexsplat.runtime.progress import duration
+from lexsplat.runtime.progress import SHORTEST_FORECAST, duration
 
 _SHORT = 0.5  # seconds below which a measurement is repeated with more crops
 _MOST_CROPS = 256
@@ -38,8 +38,10 @@ class Estimate:
     def describe(self, photos: int) -> str:
         """One line with the time of one photo and of several."""
         each = f"{self.seconds:.1f} s" if self.seconds < 60 else f"{self.seconds / 60:.1f} min"
-        total = duration(self.seconds * photos)
-        return f"{self.crops:,} crops and about {each} a photo; {total} for {photos:,} training photos"
+        seconds = self.seconds * photos
+        total = duration(seconds) if seconds >= SHORTEST_FORECAST else f"{seconds:.1f} s"
+        what = "training photo" if photos == 1 else "training photos"
+        return f"{self.crops:,} crops and about {each} a photo; {total} for {photos:,} {what}"
 
 
 def estimate(

@@ -19,10 +19,10 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from lexsplat.features.weights import INDEX, WEIGHTS, first_weights, weight_files
+from lexsplat.features.weights import INDEX, WEIGHTS, first_weights, read_config, weight_files
 from lexsplat.runtime.environment import user_cache
-from lexsplat.runtime.errors import FileFormatError, ModelError
-from lexsplat.runtime.files import atomic_path, read_json
+from lexsplat.runtime.errors import ModelError
+from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import blocks, digest
 from lexsplat.runtime.progress import NOTE
 
@@ -136,12 +136,17 @@ def _vocabulary(folder: Path) -> list[Path]:
     return [found[0], *(path for path in models if path != found[0])] if found else []
 
 
+def tokenizer_files(folder: Path) -> list[Path]:
+    """The files of a tokenizer: its vocabulary, then its settings."""
+    settings = [path for name in _TOKENIZER_SETTINGS if (path := folder / name).is_file()]
+    return [*_vocabulary(folder), *settings]
+
+
 def loaded_files(folder: Path, tower: str) -> list[Path]:
     """The files of a model folder on which its output depends, sorted."""
-    settings = [path for name in _PREPROCESSING if (path := folder / name).is_file()][:1]
+    settings = [] if (path := preprocessing_file(folder)) is None else [path]
     if tower == "clip":
-        tokenizer = [path for name in _TOKENIZER_SETTINGS if (path := folder / name).is_file()]
-        settings += [*_vocabulary(folder), *tokenizer]
+        settings += tokenizer_files(folder)
     index = [folder / INDEX] if (folder / INDEX).is_file() and len(weight_files(folder)) > 1 else []
     return sorted([folder / "config.json", *weight_files(folder), *index, *settings])
 
@@ -152,29 +157,15 @@ def preprocessing(folder: Path) -> dict[str, Any]:
     Raises:
         ModelError: If the file is damaged.
     """
-    for name in _PREPROCESSING:
-        if (folder / name).is_file():
-            content = read_config(folder / name)
-            inner = content.get("image_processor", content)
-            return inner if isinstance(inner, dict) else {}
-    return {}
+    path = preprocessing_file(folder)
+    content = {} if path is None else read_config(path, "an image preprocessor")
+    inner = content.get("image_processor", content)
+    return inner if isinstance(inner, dict) else {}
 
 
-def read_config(path: Path) -> dict[str, Any]:
-    """A JSON object of a model folder.
-
-    Raises:
-        ModelError: If the file is not a JSON object.
-    """
-    try:
-        content = read_json(path)
-    except FileFormatError as error:
-        raise ModelError(
-            path, expected=error.expected, found=error.found[:200], remedy="fetch the model again"
-        ) from error
-    if not isinstance(content, dict):
-        raise ModelError(path, expected="a JSON object", found=type(content).__name__)
-    return content
+def preprocessing_file(folder: Path) -> Path | None:
+    """The file with the settings of the image preprocessor; None if there is none."""
+    return next((path for name in _PREPROCESSING if (path := folder / name).is_file()), None)
 
 
 def content_hash(folder: Path, tower: str) -> str:
@@ -218,7 +209,7 @@ def _check_readable(path: Path, mode: int = os.R_OK) -> None:
 
 def _check_has_text(folder: Path, name: str) -> None:
     """Refuse an encoder of photos alone where an image-text model is needed: a tokenizer would not help it."""
-    config = read_config(folder / "config.json")
+    config = read_config(folder / "config.json", "a model configuration")
     if "model_type" in config and not any(key.startswith("text_config") for key in config):
         found = f"a {config['model_type']!r} model without a text tower"
         expected = "an image-text model such as CLIP"
@@ -395,7 +386,11 @@ def _refusal(name: str, tower: str, error: Exception, cache: Path, lacking: str)
     elif isinstance(error, hub.HfHubHTTPError):
         status = getattr(getattr(error, "response", None), "status_code", None)
         found = f"the hub responded with {status or 'an error'}"
+    expected = "a downloaded model"
+    remedy = f"connect to the internet and run again (it is downloaded once); or {_choices(tower)}"
     if lacking:
         found = f"a copy in {cache} without {lacking}; {found.removeprefix('no local copy, and ')}"
-    remedy = f"connect to the internet and run again (it is downloaded once); or {_choices(tower)}"
-    return refuse("a downloaded model", found, remedy)
+    elif name not in PINNED:  # OWNER/NAME may as well be a path
+        found = f"no such folder, {'' if found.startswith('no ') else 'and '}{found}"
+        expected, remedy = f"a model folder or {expected}", f"check the path, or {remedy}"
+    return refuse(expected, found, remedy)

@@ -7,19 +7,20 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import logging
 import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lexsplat.features.hub import content_hash, preprocessing
+from lexsplat.features.hub import content_hash, preprocessing, preprocessing_file
 from lexsplat.features.weights import build_model
 from lexsplat.runtime.device import one_thread
 from lexsplat.runtime.errors import ModelError
@@ -133,15 +134,45 @@ def _has_bfloat16() -> bool:
 
 
 def normalization(folder: Path, default: tuple, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation ``[3, 1, 1]`` from the model's preprocessing file, or ``default``."""
-    settings = preprocessing(folder)
-    if "image_mean" not in settings or "image_std" not in settings:
+    """Mean and standard deviation ``[3, 1, 1]`` from the model's preprocessing file, or ``default``.
+
+    Raises:
+        ModelError: If one of the two is not three finite numbers, or a deviation is not positive.
+    """
+    settings, keys = preprocessing(folder), ("image_mean", "image_std")
+    if not all(key in settings for key in keys):
         log.warning(
             "%s: no image mean in a preprocessing file; the default of the model's family is used",
             folder.name,
         )
-    mean, std = settings.get("image_mean", default[0]), settings.get("image_std", default[1])
-    return tuple(torch.tensor(v, dtype=torch.float32, device=device).reshape(3, 1, 1) for v in (mean, std))  # type: ignore[return-value]
+    given = {key: settings.get(key, list(known)) for key, known in zip(keys, default)}
+    mean, std = (_three_numbers(given[key]) for key in keys)
+    if mean is None or std is None or bool((std <= 0).any()):
+        key = keys[mean is not None]
+        raise ModelError(
+            f"{preprocessing_file(folder)}: {key}",
+            expected="three finite numbers" + (" above 0" if key == "image_std" else ""),
+            found=_excerpt(given[key]),
+            remedy="fetch the model again",
+        )
+    return mean.reshape(3, 1, 1).to(device), std.reshape(3, 1, 1).to(device)
+
+
+def _three_numbers(value: Any) -> Tensor | None:
+    """A JSON list of three numbers that are finite in float32; None for anything else."""
+    if not isinstance(value, list) or len(value) != 3 or not all(type(v) in (int, float) for v in value):
+        return None
+    try:
+        numbers = torch.tensor([float(v) for v in value], dtype=torch.float32)
+    except OverflowError:  # a whole number of hundreds of digits
+        return None
+    return numbers if bool(numbers.isfinite().all()) else None
+
+
+def _excerpt(value: Any) -> str:
+    """The begin of a JSON value, for a message."""
+    text = json.dumps(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."
 
 
 def check_images(images: Tensor) -> None:

@@ -1,10 +1,11 @@
-"""Weights of a model folder: which files are read, and their tensors under the names of transformers."""
+"""Weights and JSON of a model folder: which files are read, and tensors under the names of transformers."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import re
+import warnings
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
@@ -113,14 +114,7 @@ def _safetensors(path: Path, name: str) -> dict[str, Tensor]:
     try:
         return load_file(path)
     except (SafetensorError, OSError, ValueError) as error:
-        if _is_pointer(path):
-            raise ModelError(
-                f"model {name}: {path.name}",
-                expected="safetensors",
-                found="a pointer of Git LFS",
-                remedy=f"fetch the large files: git -C {path.parent} lfs pull",
-            ) from error
-        raise _damaged(path, name, "safetensors", error) from error
+        raise _damaged(path, name, "safetensors", _named(error)) from error
 
 
 def _is_pointer(path: Path) -> bool:
@@ -134,25 +128,41 @@ def _pickled(path: Path, name: str) -> dict[str, Tensor]:
     log.warning(
         "%s: %s has no safetensors; %s is read without running its code", name, path.parent, path.name
     )
+    expected = "a pickled dictionary of tensors only"
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a protocol that torch may not know
+            content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # UnpicklingError, RuntimeError, EOFError, KeyError ...
-        raise _damaged(path, name, "a pickled dictionary of tensors only", error) from error
+        raise _damaged(path, name, expected, _cause(path, error)) from error
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
         content = content["state_dict"]
-    if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
-        raise _damaged(path, name, "a pickled dictionary of tensors only", TypeError("other objects"))
+    if not isinstance(content, dict) or not all(
+        isinstance(key, str) and isinstance(value, Tensor) for key, value in content.items()
+    ):
+        raise _damaged(path, name, expected, "other objects")
     return {key.removeprefix("module."): value for key, value in content.items()}
 
 
-def _damaged(path: Path, name: str, expected: str, error: Exception) -> ModelError:
-    found = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'nothing'}"[:160]
-    return ModelError(
-        f"model {name}: {path.name}",
-        expected=expected,
-        found=found,
-        remedy=f"delete {path} and fetch it again",
-    )
+def _cause(path: Path, error: Exception) -> str:
+    """What is wrong with a pickled file; torch explains at length how to run the code in it."""
+    if isinstance(error, OSError | MemoryError) or "allocate memory" in str(error):
+        return _named(error)
+    if "Unsupported global" in str(error):
+        return "other objects"
+    return "a damaged file" if path.stat().st_size else "an empty file"
+
+
+def _named(error: Exception) -> str:
+    """The first line of an error of a library, with its type."""
+    return f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'nothing'}"[:160]
+
+
+def _damaged(path: Path, name: str, expected: str, found: str) -> ModelError:
+    remedy = f"delete {path} and fetch it again"
+    if _is_pointer(path):
+        found, remedy = "a pointer of Git LFS", f"fetch the large files: git -C {path.parent} lfs pull"
+    return ModelError(f"model {name}: {path.name}", expected=expected, found=found, remedy=remedy)
 
 
 def in_transformers_names(state: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -190,6 +200,30 @@ def _renamed(key: str, patterns: Iterable[tuple[str, str]]) -> str:
     return key
 
 
+def read_config(path: Path, what: str) -> dict[str, Any]:
+    """A JSON object of a model folder.
+
+    Args:
+        path: The file.
+        what: Its content, such as "a tokenizer", for messages.
+
+    Raises:
+        ModelError: If the file is not a JSON object.
+    """
+    try:
+        content = read_json(path)
+    except FileFormatError as error:
+        raise _no_json(path, what, error.found[:200]) from error
+    if not isinstance(content, dict):
+        kinds = {list: "a list", str: "a text", type(None): "null"}
+        raise _no_json(path, what, kinds.get(type(content), f"{content}"[:20]))
+    return content
+
+
+def _no_json(path: Path, what: str, found: str) -> ModelError:
+    return ModelError(path, expected=f"{what} in JSON", found=found, remedy="fetch the model again")
+
+
 def build_model(folder: Path, name: str, spare: str) -> Any:
     """The model of transformers that a folder describes, with all its weights.
 
@@ -204,6 +238,8 @@ def build_model(folder: Path, name: str, spare: str) -> Any:
     """
     from transformers import AutoConfig, AutoModel
 
+    what = "a model configuration"
+    kind_of_model = read_config(folder / "config.json", what).get("model_type")
     state = load_weights(folder, name)
     try:
         config = AutoConfig.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
@@ -219,6 +255,8 @@ def build_model(folder: Path, name: str, spare: str) -> Any:
             None, config=config, state_dict=state, output_loading_info=True, ignore_mismatched_sizes=True
         )
     except Exception as error:  # KeyError, OSError, ValueError, RuntimeError ...
+        if not isinstance(kind_of_model, str):  # transformers may do without, by the name of the folder
+            raise _no_json(folder / "config.json", what, "no model_type") from error
         raise ModelError(
             f"model {name}",
             expected="a model that transformers can load",

@@ -14,12 +14,12 @@ from lexsplat.features.cache import without_masked_cells
 from lexsplat.features.checks import ENOUGH, check_dense, rank_words
 from lexsplat.features.clip import check_patches
 from lexsplat.features.clip_text import UNLIKE_WORDS
-from lexsplat.features.estimate import estimate
+from lexsplat.features.estimate import Estimate, estimate
 from lexsplat.features.extraction import missing_views
 from lexsplat.features.hub import model_folder
 from lexsplat.features.segments2d import load_segmenter, pooled_features
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.runtime.progress import NOTE, Event, Listener, silent
+from lexsplat.runtime.progress import NOTE, SHORTEST_FORECAST, Event, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
@@ -49,7 +49,7 @@ class Encoders:
     def __init__(self, clip: str, dino: str, device: str, segments: str = "none") -> None:
         self._clip_name, self._dino_name, self._segments, self.device = clip, dino, segments, device
         self.text: TextTower | None = None
-        self.told = False  # whether the time of the features is logged
+        self.told = False  # whether the time of the features is estimated, and logged unless it is short
 
     @classmethod
     def of(cls, config: BuildConfig) -> Encoders:
@@ -156,9 +156,7 @@ def check_encoders(
         check_dense(encoders.dino)
     listener(Event("encoders", 3, 4))
     if photos:
-        found = estimate(encoders.clip, encoders.dino, config.features, size)
-        log.log(NOTE, "features on %s: %s", config.encoder_device, found.describe(photos))
-        encoders.told = True
+        _tell(estimate(encoders.clip, encoders.dino, config.features, size), photos, encoders)
     listener(Event("encoders", 4, 4))
     return encoders
 
@@ -171,7 +169,13 @@ def _tell_time(capture: Capture, config: BuildConfig, encoders: Encoders, cache_
         return
     sizes = [capture.views[name].capture_size for name in missing]
     found = estimate(clip, dino, settings, max(sizes, key=lambda size: size[0] * size[1]))
-    log.log(NOTE, "features on %s: %s", config.encoder_device, found.describe(len(missing)))
+    _tell(found, len(missing), encoders)
+
+
+def _tell(found: Estimate, photos: int, encoders: Encoders) -> None:
+    """Log the estimated time of the features of some photos, unless it is short."""
+    if found.seconds * photos >= SHORTEST_FORECAST:
+        log.log(NOTE, "features on %s: %s", encoders.device, found.describe(photos))
     encoders.told = True
 
 

@@ -98,16 +98,19 @@ def warn_of_few_photos(capture: Capture, gaussians: Gaussians) -> None:
         trained, held_out = (
             _psnr(capture, gaussians, views) for views in (capture.train_views, capture.test_views)
         )
-        count = len(capture.test_views)
-        measured = (
-            f": {count} held-out photos are rendered at {held_out:.1f} dB, trained ones at {trained:.1f} dB"
-        )
+        count = _counted(len(capture.test_views), "held-out")
+        measured = f": {count} rendered at {held_out:.1f} dB, trained ones at {trained:.1f} dB"
     log.warning(
-        "%d training photos are few%s; views far from every photo are guessed, so take 30 photos or more that overlap"
+        "%s few%s; views far from every photo are guessed, so take 30 photos or more that overlap"
         " by 60 to 80 percent",
-        len(capture.train_views),
+        _counted(len(capture.train_views), "training"),
         measured,
     )
+
+
+def _counted(count: int, kind: str) -> str:
+    """Begin of a sentence about photos: "1 training photo is", "2 training photos are"."""
+    return f"{count} {kind} photo is" if count == 1 else f"{count} {kind} photos are"
 
 
 @torch.no_grad()

@@ -17,7 +17,7 @@ logging.addLevelName(NOTE, "note")
 
 log = logging.getLogger("lexsplat")
 
-_TOLD_FROM = 2.0
+SHORTEST_FORECAST = 2.0
 """Shortest stage with a forecast, in seconds."""
 
 
@@ -114,7 +114,7 @@ def tell(stage: str, seconds: float, amount: str) -> None:
         seconds: The forecast.
         amount: Amount of work, such as "2,000 iterations".
     """
-    if seconds >= _TOLD_FROM:
+    if seconds >= SHORTEST_FORECAST:
         log.log(NOTE, "%s: about %s for %s", stage, duration(seconds), amount)
 
 

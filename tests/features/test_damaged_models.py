@@ -1,0 +1,182 @@
+"""Model folders with a damaged file: one line names the file, and nothing is left behind."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from support.encoder_folders import save_model, seeded, tiny_vit
+from support.refusals import assert_reports
+
+from lexsplat import cli
+from lexsplat.features.encoders import load_clip, load_dino
+from lexsplat.features.text import load_text
+from lexsplat.runtime.errors import ModelError
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
+
+HUGE = int("9" * 400)
+
+
+@pytest.fixture
+def clip_copy(clip_folder, tmp_path) -> Path:
+    """A copy of the tiny CLIP to damage."""
+    return shutil.copytree(clip_folder, tmp_path / "copy")
+
+
+@pytest.fixture(scope="module")
+def vit_folder(tmp_path_factory) -> Path:
+    return save_model(seeded(tiny_vit), tmp_path_factory.mktemp("vit"))
+
+
+def refused(folder: Path, *parts: str, load=load_clip) -> str:
+    with pytest.raises(ModelError) as caught:
+        load(str(folder))
+    assert_reports(caught.value, *parts)
+    return str(caught.value)
+
+
+# -- the image preprocessor
+
+
+@pytest.mark.parametrize(
+    ("mean", "found"),
+    [
+        (None, "found null"),
+        (0.5, "found 0.5"),
+        ("0.5", 'found "0.5"'),
+        ([0.5, 0.5], "found [0.5, 0.5]"),
+        ([0.5, None, 0.5], "found [0.5, null, 0.5]"),
+        ([True, True, True], "found [true, true, true]"),
+        ([0.5, 0.5, float("nan")], "found [0.5, 0.5, NaN]"),
+        ([[0.5, 0.5, 0.5]], "found [[0.5, 0.5, 0.5]]"),
+        ([0.5, 0.5, HUGE], "found [0.5, 0.5, 999"),
+        ([0.5, 0.5, 1e300], "found [0.5, 0.5, 1e+300]"),
+        ([0.5] * 1000, "..."),
+    ],
+)
+def test_an_image_mean_that_is_not_three_numbers_is_refused(vit_folder, tmp_path, mean, found):
+    folder = shutil.copytree(vit_folder, tmp_path / "vit")
+    path = folder / "preprocessor_config.json"
+    path.write_text(json.dumps({"image_mean": mean, "image_std": [0.5, 0.5, 0.5]}))
+    expected = f"{path}: image_mean: expected three finite numbers, "
+    message = refused(folder, expected, found, "fetch the model again", load=load_dino)
+    assert len(message) < len(expected) + 250
+
+
+@pytest.mark.parametrize("std", [None, 1, [0.5, 0.5, 0], [0.5, 0.5, -0.5], [0.5, 0.5, 1e-300]])
+def test_an_image_deviation_that_is_not_three_positive_numbers_is_refused(vit_folder, tmp_path, std):
+    folder = shutil.copytree(vit_folder, tmp_path / "vit")
+    (folder / "preprocessor_config.json").unlink()
+    content = {"image_processor": {"image_mean": [0.5, 0.5, 0.5], "image_std": std}}
+    (folder / "processor_config.json").write_text(json.dumps(content))
+    expected = "processor_config.json: image_std: expected three finite numbers above 0"
+    refused(folder, expected, f"found {json.dumps(std)}", load=load_dino)
+
+
+def test_whole_numbers_are_numbers_and_other_entries_are_not_read(vit_folder, tmp_path):
+    folder = shutil.copytree(vit_folder, tmp_path / "vit")
+    content = {"image_mean": [0, 0, 0], "image_std": [1, 1, 1]}
+    content |= {"size": None, "crop_size": "large", "rescale_factor": [], "resample": {}}
+    (folder / "preprocessor_config.json").write_text(json.dumps(content))
+    encoder = load_dino(str(folder))
+    assert encoder._mean.flatten().tolist() == [0, 0, 0]
+    assert encoder._std.flatten().tolist() == [1, 1, 1]
+    assert encoder.encode_dense(torch.rand(3, 32, 32), short_side=32).isfinite().all()
+
+
+def test_a_damaged_preprocessor_is_refused_by_each_command_and_leaves_no_folder(
+    clip_copy, vit_folder, tiny_capture, tmp_path, capsys
+):
+    dino, output = shutil.copytree(vit_folder, tmp_path / "vit"), tmp_path / "new" / "scene"
+    for folder in (clip_copy, dino):
+        (folder / "preprocessor_config.json").write_text('{"image_mean": null, "image_std": null}')
+    build = ["build", str(tiny_capture), "--output", str(output), "--device", "cpu"]
+    for words in (
+        ["encoders", "--clip", str(clip_copy)],
+        ["encoders", "--clip", "bundled", "--dino", str(dino)],
+        [*build, "--clip", str(clip_copy), "--dino", "none"],
+    ):
+        assert cli.main(words) == 1
+        error = capsys.readouterr().err.splitlines()[-1]
+        assert error.startswith("error: ")
+        assert "preprocessor_config.json: image_mean: expected three finite numbers, found null" in error
+    assert not output.parent.exists()
+
+
+# -- pickled weights
+
+
+def pickled(folder: Path, content: bytes | dict) -> Path:
+    """Replace the weights of a folder by a pickled file."""
+    (folder / "model.safetensors").unlink()
+    path = folder / "pytorch_model.bin"
+    if isinstance(content, dict):
+        torch.save(content, path)
+    else:
+        path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"\x80\x04\x95" + b"garbage" * 9, "a damaged file"),
+        (b"\x80\x02" + b"\xff" * 50, "a damaged file"),
+        (b"hello world", "a damaged file"),
+        (b"PK\x03\x04" + b"x" * 90, "a damaged file"),
+        (b"", "an empty file"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 598641023\n", "a pointer of Git LFS"),
+        ({"weight": Path("a")}, "other objects"),
+        ({"weight": 3}, "other objects"),
+        ({1: torch.ones(3)}, "other objects"),
+    ],
+)  # fmt: skip
+def test_pickled_weights_that_are_not_tensors_are_refused_in_words_of_lexsplat(
+    clip_copy, content, found, recwarn
+):
+    path = pickled(clip_copy, content)
+    expected = "pytorch_model.bin: expected a pickled dictionary of tensors only, "
+    message = refused(clip_copy, f"{expected}found {found}; ", str(path.parent))
+    assert "PyTorch" not in message
+    assert not [one for one in recwarn if "pickle" in str(one.message)]
+
+
+# -- configuration and tokenizer
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        ("", "Expecting value"),
+        ("[]", "a list"),
+        ("null", "null"),
+        ("{}", "no model_type"),
+        ('{"model_type": 3}', "no model_type"),
+    ],
+)
+def test_a_damaged_configuration_is_refused_by_its_name(clip_copy, vit_folder, tmp_path, content, found):
+    vit = shutil.copytree(vit_folder, tmp_path / "vit")
+    for folder, load in ((clip_copy, load_clip), (clip_copy, load_text), (vit, load_dino)):
+        path = folder / "config.json"
+        path.write_text(content)
+        expected = f"{path}: expected a model configuration in JSON, found {found}"
+        refused(folder, expected, "fetch the model again", load=load)
+
+
+@pytest.mark.parametrize("name", ["tokenizer.json", "tokenizer_config.json", "special_tokens_map.json"])
+@pytest.mark.parametrize(("content", "found"), [("", "Expecting value"), ("[]", "a list"), ("null", "null")])
+def test_a_damaged_file_of_the_tokenizer_is_refused_by_its_name(clip_copy, name, content, found):
+    (clip_copy / name).write_text(content)
+    expected = f"{clip_copy / name}: expected a tokenizer in JSON, found {found}"
+    refused(clip_copy, expected, "fetch the model again")
+
+
+@pytest.mark.parametrize("content", ["{}", '{"added_tokens": 3}', '{"model": []}'])
+def test_json_that_is_no_tokenizer_is_refused_by_its_name(clip_copy, content):
+    (clip_copy / "tokenizer.json").write_text(content)
+    message = refused(clip_copy, f"{clip_copy / 'tokenizer.json'}: expected a tokenizer, found other content")
+    assert "added_tokens'" not in message
