@@ -108,7 +108,8 @@ def test_recoloring_changes_hue_and_keeps_shading(base):
 def test_recolored_highlights_keep_their_luminance_and_turn_pale(base):
     scene, labels = base
     thing = scene.gaussians.select(torch.from_numpy(labels == 0))
-    shade = torch.linspace(-1.0, 1.5, 30)
+    shade = torch.linspace(-1.0, 0.0, 30)
+    shade[-2:] = torch.tensor([1.0, 1.5])
     thing = replace(thing, sh0=shade[:, None, None].expand(30, 1, 3).clone())
     blue = recolored(thing, (0.1, 0.3, 0.9), 1.0).sh0[:, 0] * 0.28209479177387814 + 0.5
     assert float(blue.max()) <= 1 + 1e-5
@@ -117,6 +118,19 @@ def test_recolored_highlights_keep_their_luminance_and_turn_pale(base):
     assert torch.allclose(luminance / luminance[0], old / old[0], rtol=1e-3)
     saturation = 1 - blue[:, 0] / blue[:, 2]
     assert saturation[-1] < saturation[0] - 0.1
+    assert torch.allclose(saturation[:-2], saturation[:1], atol=1e-4)
+
+
+@pytest.mark.parametrize("color", [(0.0, 0, 1), (1, 0, 0), (1, 1, 0), (1, 1, 1)])
+def test_the_shading_of_a_thing_in_a_pure_color_is_darker_and_not_flat(base, color):
+    scene, labels = base
+    thing = scene.gaussians.select(torch.from_numpy(labels == 0))
+    shade = torch.linspace(-1.0, 1.5, 30)
+    thing = replace(thing, sh0=shade[:, None, None].expand(30, 1, 3).clone())
+    found = (recolored(thing, color, 1.0).sh0[:, 0] * 0.28209479177387814 + 0.5).amax(1)
+    old = shade * 0.28209479177387814 + 0.5
+    assert torch.allclose((found / found[0])[:26], (old / old[0])[:26], rtol=1e-3)
+    assert float(found.max()) <= 1 + 1e-5
 
 
 @given(st.lists(st.sampled_from(["delete", "recolor", "move", "duplicate", "undo", "redo"]), max_size=9))

@@ -34,6 +34,8 @@ from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.transforms import transformed
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
+_BRIGHT = 0.9
+"""Quantile of the shading from which on a recolored thing may turn pale."""
 MAX_GROWTH = 16
 """Largest number of Gaussians after edits, as a multiple of the original: copies of copies would fill the memory."""
 
@@ -94,8 +96,8 @@ def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> 
 
     Args:
         gaussians: The Gaussians of an object.
-        color: Mean RGB in 0..1 afterwards, where none would be brighter than 1: such parts are mixed with gray of
-            their luminance, as highlights are.
+        color: Mean RGB in 0..1 afterwards. It is darkened where more than a tenth of the thing would be brighter than
+            1, and the tenth is mixed with gray of its luminance, as highlights are.
         strength: 0 changes nothing, 1 removes the old hue and the view-dependent color.
 
     Raises:
@@ -113,7 +115,10 @@ def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> 
     weights = torch.tensor(_LUMINANCE).to(old)
     light = (old.clamp(0, 1) @ weights).clamp_min(0.02)
     shares = gaussians.opacities / gaussians.opacities.sum().clamp_min(1e-12)
-    new = target * (light / (light * shares).sum())[:, None]
+    shading = light / (light * shares).sum()
+    ordered, order = shading.sort()
+    bright = ordered[int((shares[order].cumsum(0) < _BRIGHT).sum().clamp_max(len(shading) - 1))]
+    new = target * (shading / (target.max() * bright).clamp_min(1))[:, None]
     gray = (new @ weights)[:, None].clamp_max(1)
     room = (1 - gray) / (new.amax(1, keepdim=True) - gray).clamp_min(1e-6)
     new = gray + room.clamp_max(1) * (new - gray)
