@@ -42,7 +42,7 @@ from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError, SceneFolderError
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.runtime.progress import Listener
+from lexsplat.runtime.progress import NOTE, Listener
 from lexsplat.scenes.folder import SceneFolder
 
 log = logging.getLogger("lexsplat")
@@ -244,7 +244,7 @@ def _registered_images(
     found = poses_from_photos(photos, poses, config.poses, seed=config.seed, memory=memory, listener=listener)
     for note in found.notes:
         log.warning(note)
-    log.log(logging.INFO if found.is_complete else logging.WARNING, found.note)
+    log.log(NOTE if found.is_complete else logging.WARNING, found.note)
     inside = found.images.resolve().is_relative_to(folder.root.resolve())
     images = "poses/images" if inside else str(found.images.resolve())
     facts = {
