@@ -1,6 +1,5 @@
 import os
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -29,9 +28,6 @@ from lexsplat.geometry.cameras import look_at
 from lexsplat.runtime.errors import CaptureError
 
 pytestmark = pytest.mark.slow
-
-FEW_FEATURES = PoseConfig(max_features=600)
-"""The usual settings, but photos are matched and registered in less time."""
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +111,7 @@ def test_a_mis_registered_photo_is_registered_again(room, tmp_path, monkeypatch)
         return found
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", misled_once)
-    poses = poses_from_photos(folder, tmp_path / "poses", FEW_FEATURES)
+    poses = poses_from_photos(folder, tmp_path / "poses")
     assert moved, "there was something to put right"
     capture = load_capture(poses.root, images=folder, test_every=0)
     assert_same_up_to_a_similarity(
@@ -237,7 +233,7 @@ def phone(tmp_path_factory):
         else:
             save(folder / "masks" / f"{index}.png", mask[::2, ::2])
     save(folder / "masks" / "nobody.png", np.ones((4, 4)))
-    config = replace(FEW_FEATURES, mapper="global")
+    config = PoseConfig(mapper="global")
     return folder, poses_from_photos(folder, tmp_path_factory.mktemp("poses"), config)
 
 
@@ -275,8 +271,8 @@ def test_photos_left_over_by_sequential_matching_are_matched_with_all(tmp_path, 
         save(tmp_path / "photos" / f"{index}.png", room_photo(camera))
         save(tmp_path / "photos" / f"{index}blank.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
     with pytest.raises(CaptureError, match="none of which could be registered"):
-        poses_from_photos(tmp_path / "photos", tmp_path / "out", replace(FEW_FEATURES, pairs="sequential"))
-    poses = poses_from_photos(tmp_path / "photos", tmp_path / "out", FEW_FEATURES)
+        poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig(pairs="sequential"))
+    poses = poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig())
     assert poses.registered == tuple(f"{index}.png" for index in range(COUNT))
     assert (
         f'found by the mapper "{poses.mapper}" after all pairs of those left over were matched' in poses.note
@@ -294,7 +290,7 @@ def test_forward_facing_photos_are_registered_by_a_more_lenient_mapper(tmp_path)
     ]
     for index, camera in enumerate(cameras):
         save(tmp_path / "photos" / f"{index}.png", room_photo(camera))
-    poses = poses_from_photos(tmp_path / "photos", tmp_path / "out", FEW_FEATURES)
+    poses = poses_from_photos(tmp_path / "photos", tmp_path / "out")
     assert len(poses.registered) == len(cameras)
     assert poses.mapper != "incremental"
     assert f'found by the mapper "{poses.mapper}"' in poses.note
