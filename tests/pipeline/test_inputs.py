@@ -28,7 +28,7 @@ from lexsplat.scenes.folder import SceneFolder
 
 pytestmark = pytest.mark.slow
 
-QUICK = ["--device", "cpu", "--iterations", "2", "--downscale", "4", "--poses.max-features", "600"]
+QUICK = ["--device", "cpu", "--iterations", "2", "--downscale", "4"]
 
 
 def run(command: str, capture, output, *further: str) -> int:
