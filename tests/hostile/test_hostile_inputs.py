@@ -1,6 +1,6 @@
 """Whatever a file contains, a reader returns a valid result or raises a typed error of one line.
 
-`support.hostile` registers every reader with a valid input and its mutations. They run in another process with one
+`support.hostile` registers every reader with a valid input and its mutations. They run in two processes with one
 gigabyte of spare memory and a few seconds per input; a crash, a hang or another exception fails the reader's test.
 """
 
@@ -35,7 +35,7 @@ pytestmark = [
 
 LEAST_INPUTS = 30_000
 LEAST_SPLATS = 13_000
-PROCESSES = 1  # each further one starts for some seconds of processor time
+PROCESSES = 2
 SPLATS = [name for name, make in READERS.items() if make.__module__.endswith(".splats")]
 
 
