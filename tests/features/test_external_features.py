@@ -148,7 +148,7 @@ def segments(tmp_path_factory) -> Path:
 def embed(capture: Path, output: Path, built: Path, features: Path, *options: str) -> int:
     return cli.main([
         "language", str(capture), "--output", str(output), "--splats", str(built / "gaussians.ply"),
-        "--clip", "bundled", "--device", "cpu", "--codebook.num-codes", "16",
+        "--clip", "bundled", "--device", "cpu", "--codebook.num-codes", "8",
         "--features-from", str(features), *options,
     ])  # fmt: skip
 

@@ -103,7 +103,7 @@ def write_capture(folder: Path, *, views: int = 12, width: int = 96, height: int
                 Image.fromarray(((hit == index) * 255).astype(np.uint8)).save(mask)
         else:
             near = np.linalg.norm(where, axis=-1) < 4
-            chosen = rng.choice(np.flatnonzero(near), 216, replace=False)
+            chosen = rng.choice(np.flatnonzero(near), 120, replace=False)
             points.append(where.reshape(-1, 3)[chosen])
             colors.append(color.reshape(-1, 3)[chosen])
     sparse = folder / "sparse" / "0"
