@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from support.encoder_folders import save_model, seeded, tiny_vit
 from support.refusals import assert_reports
 
 from lexsplat import cli
@@ -19,17 +18,6 @@ from lexsplat.runtime.errors import ModelError
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 HUGE = int("9" * 400)
-
-
-@pytest.fixture
-def clip_copy(clip_folder, tmp_path) -> Path:
-    """A copy of the tiny CLIP to damage."""
-    return shutil.copytree(clip_folder, tmp_path / "copy")
-
-
-@pytest.fixture(scope="module")
-def vit_folder(tmp_path_factory) -> Path:
-    return save_model(seeded(tiny_vit), tmp_path_factory.mktemp("vit"))
 
 
 def refused(folder: Path, *parts: str, load=load_clip) -> str:

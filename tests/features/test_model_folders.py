@@ -25,17 +25,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 TOKENIZER = ("tokenizer.json", "tokenizer_config.json")
 
 
-@pytest.fixture
-def clip_copy(clip_folder, tmp_path) -> Path:
-    """A copy of the tiny CLIP to damage."""
-    return shutil.copytree(clip_folder, tmp_path / "copy")
-
-
-@pytest.fixture(scope="module")
-def vit_folder(tmp_path_factory) -> Path:
-    return save_model(seeded(tiny_vit), tmp_path_factory.mktemp("vit"))
-
-
 def rewrite(folder: Path, change, name: str = "model.safetensors") -> None:
     """Replace the weights of a folder by ``change`` of them, under another name if one is given."""
     state = load_file(folder / "model.safetensors")
