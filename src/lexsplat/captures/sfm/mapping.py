@@ -20,6 +20,7 @@ from lexsplat.captures.sfm.feature_budget import extraction_threads, matching_pl
 from lexsplat.captures.sfm.pose_agreement import misregistered, register_again
 from lexsplat.captures.sfm.pycolmap_import import pycolmap
 from lexsplat.runtime import memory as budget
+from lexsplat.runtime.errors import BackendError
 from lexsplat.runtime.files import atomic_path
 
 if TYPE_CHECKING:
@@ -47,6 +48,21 @@ Pairs = Callable[[int, int], None]
 
 Mapper = Literal["incremental", "small angles", "global"]
 """How models are found: photo by photo, the same from pairs with small angles, or all photos at once (GLOMAP)."""
+
+
+def require_global() -> None:
+    """Check that this pycolmap has the global mapper.
+
+    Raises:
+        BackendError: If it has none.
+    """
+    if not HAS_GLOBAL:
+        raise BackendError(
+            "the global mapper",
+            expected="pycolmap 4 or later",
+            found=pycolmap.__version__,
+            remedy="pip install --upgrade pycolmap, or use the incremental mapper",
+        )
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Literal
 from lexsplat.captures.sfm.feature_budget import check_mapping
 from lexsplat.captures.sfm.preparation import PreparedPhotos, photo_folder, prepare_photos
 from lexsplat.runtime import memory as budget
-from lexsplat.runtime.errors import BackendError, CaptureError
+from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import file_stamp, fingerprint
 from lexsplat.runtime.progress import Event, FirstUnits, Listener, silent, uncounted
@@ -146,13 +146,8 @@ def poses_from_photos(
     from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
 
     folder, output, config = photo_folder(Path(folder)), Path(output), config or PoseConfig()
-    if config.mapper == "global" and not mapping.HAS_GLOBAL:
-        raise BackendError(
-            "the global mapper",
-            expected="pycolmap 4 or later",
-            found=mapping.pycolmap.__version__,
-            remedy="pip install --upgrade pycolmap, or use the incremental mapper",
-        )
+    if config.mapper == "global":
+        mapping.require_global()
     photos = prepare_photos(folder, output, memory=memory, listener=listener)
     names, total = photos.names, 2 * len(photos.names) + 1
     work = _work_folder(output, photos, config, seed)
@@ -184,10 +179,10 @@ def poses_from_photos(
     _discard(work, output)
     registered = tuple(sorted(set(names) - set(unregistered)))
     listener(Event(STAGE, total, total, {"registered": len(registered), "photos": len(names)}))
-    points = best.model.num_points3D()
+    points, images = best.model.num_points3D(), photos.images
     return PhotoPoses(
         output,
-        photos.images,
+        images,
         registered,
         unregistered,
         points,
