@@ -5,7 +5,7 @@ A command class may have these attributes in addition to its fields:
 - ``essential``: names of the settings of a build that ``--help`` shows; ``--help-all`` shows the others, too;
 - ``rare``: names of the command's own options that only ``--help-all`` shows;
 - ``unused``: names of the settings that the command accepts and ignores, which no help page shows;
-- ``defaults``: words for the defaults of options that are None or empty, where `_DEFAULTS` does not suit;
+- ``defaults``: help texts of options whose default is None or empty, in place of those in `_DEFAULTS`;
 - ``synonyms``: other spellings of options;
 - ``elsewhere``: options of another command, with the command that has them.
 
@@ -64,9 +64,9 @@ _DEFAULTS = {
     "up": "from the cameras",
     "averaged.dino": "by the tokens of CLIP",
 }
-"""Words on help pages for defaults that are None or empty. Those of the command come first.
+"""Help texts by name of option, for options whose default is None or empty.
 
-Settings of a part have the name of the part in front.
+Names of the settings of a part begin with the name of the part.
 """
 
 _RENAMED = {
