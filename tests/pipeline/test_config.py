@@ -189,6 +189,17 @@ def test_as_in_paper_stands_for_the_settings_of_the_paper_and_keeps_those_that_a
     codebook, trained = CodebookConfig(num_codes=64), TrainedConfig(iterations=9)
     short = BuildConfig(as_in_paper=True, iterations=50, codebook=codebook, trained=trained).spelled_out()
     assert (short.iterations, short.codebook.num_codes, short.trained.iterations) == (50, 64, 9)
+    codebook, trained = (
+        CodebookConfig(learning_rate=0.3, steps=7),
+        TrainedConfig(semantics_lr=0.2, pixel_sample=5),
+    )
+    kept = BuildConfig(as_in_paper=True, codebook=codebook, trained=trained).spelled_out()
+    assert (kept.codebook.learning_rate, kept.codebook.steps, kept.codebook.batch_size) == (0.3, 7, 16_384)
+    assert (kept.trained.semantics_lr, kept.trained.pixel_sample, kept.trained.decoder_lr) == (0.2, 5, 0.001)
+    with pytest.raises(ValueError, match="random crops have no patches"):
+        BuildConfig(as_in_paper=True, features=FeatureConfig(crop_tokens="both"))
+    with pytest.raises(ValueError, match="leave --blocks out"):
+        BuildConfig(as_in_paper=True, blocks="2")
     assert BuildConfig().spelled_out() == BuildConfig()
 
 

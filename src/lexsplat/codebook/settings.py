@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
+
+from lexsplat.runtime.defaults import where_not_given
 
 MAX_CODES = 256
 """Most codes of a codebook: an index map has one byte a pixel."""
@@ -65,14 +67,13 @@ class CodebookConfig:
             )
 
     def as_in_paper(self) -> CodebookConfig:
-        """The paper's fit with the same loss weights: gradient steps on Eq. 7 from a random start.
+        """The paper's 128 codes, fitted as the authors' code fits them: gradient steps on Eq. 7 from a random start.
 
-        The number of codes becomes the paper's unless it was changed.
+        The paper states the loss and the number of codes only. Settings that differ from their defaults are kept.
         """
-        codes = PAPER_CODES if self.num_codes == CodebookConfig.num_codes else self.num_codes
-        return replace(
+        return where_not_given(
             self,
-            num_codes=codes,
+            num_codes=PAPER_CODES,
             init="uniform",
             steps=2000,
             learning_rate=1e-4,

@@ -151,6 +151,8 @@ class BuildConfig:
             World.of_cameras([]).with_up(parse_vector(self.up))
         if self.test_every < 0 or self.test_every == 1:
             raise ValueError(f"test_every must be 0 (hold out nothing) or at least 2, got {self.test_every}")
+        if self.as_in_paper and not (self.joint and self.features.mode == "random"):
+            self.spelled_out()  # refuses what contradicts it
 
     def result_settings(self) -> BuildConfig:
         """These settings with everything that does not affect the result at its default, for fingerprints.
@@ -195,18 +197,15 @@ class BuildConfig:
         """With `as_in_paper`, the settings that it stands for; otherwise the same."""
         if not self.as_in_paper:
             return self
-        trained = self.trained.as_in_paper()
-        if self.trained.iterations != TrainedConfig.iterations:
-            trained = replace(trained, iterations=self.trained.iterations)
         return replace(
             self,
             method="trained",
             joint=True,
             iterations=self.iterations or PAPER_ITERATIONS,
             reconstruction=replace(self.reconstruction, antialiased=False),
-            features=replace(self.features, mode="random", crop_tokens=None),
+            features=replace(self.features, mode="random"),
             codebook=self.codebook.as_in_paper(),
-            trained=trained,
+            trained=self.trained.as_in_paper(),
         )
 
     def resolved(self, device: str, capture_size: tuple[int, int]) -> BuildConfig:

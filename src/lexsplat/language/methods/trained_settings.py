@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from lexsplat.language.losses import SmoothingWeight, UncertaintyForm
+from lexsplat.runtime.defaults import where_not_given
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,11 @@ class TrainedConfig:
             raise ValueError("render_downscale and final_lr_factor must be positive")
 
     def as_in_paper(self) -> TrainedConfig:
-        """30,000 iterations over full maps with a constant learning rate of 0.001."""
-        return replace(
+        """30,000 iterations over full maps with a constant learning rate of 0.001.
+
+        Settings that differ from their defaults are kept.
+        """
+        return where_not_given(
             self,
             iterations=30_000,
             pixel_sample=0,
