@@ -275,7 +275,8 @@ def test_photos_left_over_by_sequential_matching_are_matched_with_all(tmp_path, 
     poses = poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig())
     assert poses.registered == tuple(f"{index}.png" for index in range(COUNT))
     assert (
-        f'found by the mapper "{poses.mapper}" after all pairs of those left over were matched' in poses.note
+        f'found by the mapper "{poses.mapper}" after all pairs of the unregistered photos were matched'
+        in poses.note
     )
     views = load_capture(poses.root, images=poses.images, test_every=0).views
     assert_same_up_to_a_similarity([views[f"{index}.png"].camera for index in range(COUNT)], cameras)

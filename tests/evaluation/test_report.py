@@ -107,7 +107,7 @@ def test_a_scene_without_masks_has_a_report(result, tmp_path):
     write_report(tmp_path / "report.html", bare, Gallery())
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     Page(text)
-    assert "no masks" in text
+    assert "no ground truth" in text
     assert "PSNR 31.23 dB" in format_table(bare.to_json())
 
 

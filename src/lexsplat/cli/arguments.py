@@ -55,7 +55,7 @@ _PLACEHOLDERS = {
 """Placeholders by name of option; that of an option with any number of values is followed by an ellipsis."""
 _DEFAULTS = {
     "clip": "the encoder of the build",
-    "view": "the view that shows the other thing best",
+    "view": "what most of the views that show both things say",
     "threshold": "chosen for each phrase",
     "ground_truth": "the ground truth in the capture or beside it",
     "prompt_list": "the prompts of the ground truth",

@@ -36,8 +36,9 @@ def _is_splats(capture: str) -> bool:
 class Build:
     """Make a searchable scene from photos, with or without cameras, or from a video.
 
-    Runs all stages: reconstruct, features, codebook, language. Run the same command again to continue after an
-    interruption. After a change of settings, only the stages that depend on them run again.
+    Runs all stages: reconstruct, features and language, and for method trained the codebook before language. Run the
+    same command again to continue after an interruption. After a change of settings, only the stages that depend on
+    them run again.
 
     Args:
         capture: Folder with photos and cameras: a COLMAP model (images/ and sparse/0/) or a transforms.json of
@@ -147,7 +148,8 @@ class Build:
 class Reconstruct(Build):
     """Reconstruct 3D Gaussians from photos: the first stage of build.
 
-    Settings of the later stages are accepted, so that one set of options serves both commands; they have no effect.
+    Settings of the later stages are accepted, so that one set of options serves both commands. They have no effect.
+    Only --as-in-paper and --joint train language along, so that features and codebook run first.
     """
 
     essential: ClassVar[tuple[str, ...]] = tuple(

@@ -16,13 +16,13 @@ from lexsplat.pipeline.config import BuildConfig
 class Demo:
     """Build, query and evaluate a bundled capture.
 
-    Reconstructs the scene, extracts language features with the bundled encoders, fits the codebook, makes the
-    language field, answers queries on held-out views and compares the answers with exact masks. Needs no network
+    Reconstructs the scene, extracts language features with the bundled encoders, makes the language field,
+    answers queries on held-out views and compares the answers with exact ground truth. Needs no network
     and no GPU. Run the same command again to continue after an interruption.
 
     Args:
         output: Folder for all results.
-        scene: Which bundled capture: the table top, or the second and smaller one.
+        capture: The bundled capture to take: the table top, or the second and smaller one.
         method: Method that puts language on the Gaussians (see lexsplat build --help).
         device: "auto" takes CUDA where there is a GPU.
         seed: Seed of all randomness.
@@ -30,12 +30,13 @@ class Demo:
     """
 
     output: Path = Path("output/demo")
-    scene: Literal["tabletop", "second"] = "tabletop"
+    capture: Literal["tabletop", "second"] = "tabletop"
     method: MethodName | None = None
     device: Device = "auto"
     seed: int = 0
     iterations: int | None = None
 
+    synonyms: ClassVar[dict[str, str]] = {"--scene": "--capture"}
     defaults: ClassVar[dict[str, str]] = {"method": "averaged"}
 
     def check(self) -> None:
@@ -51,7 +52,7 @@ class Demo:
         with ProgressBars() as bars:
             result = run_demo(
                 self.output,
-                scene=self.scene,
+                capture=self.capture,
                 method=self.method,
                 device=self.device,
                 seed=self.seed,

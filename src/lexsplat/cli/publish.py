@@ -33,7 +33,7 @@ class Publish:
         start_view: Name of the view from which the page starts.
         max_splats: Publish this many Gaussians, those that cover most.
         words_only: Leave out the text tower: the page answers only the phrases of its dictionary.
-        single_file: Write one HTML file that opens by double click, up to 50 MB.
+        single_file: Write one HTML file that opens by double click, of files of up to 50 MB.
         clip: Text encoder: a name on the Hugging Face Hub or a folder.
         device: "auto" takes CUDA where there is a GPU.
     """

@@ -39,7 +39,7 @@ class Query:
         form: Form of relevancy: "feature" blends features, then compares (the paper); "code" compares each code, then
             blends; "segment" takes whole segments by the scores of "code".
         negatives: Phrases that a prompt is compared with.
-        temperature: Factor on cosine similarities.
+        temperature: Factor on cosine similarities, for --form feature and with --negatives.
         template: Sentences with {} in place of the prompt, such as "a photo of a {}".
         clip: Text encoder: a name on the Hugging Face Hub or a folder.
         device: "auto" takes CUDA where there is a GPU.
@@ -63,7 +63,7 @@ class Query:
 
     synonyms: ClassVar[dict[str, str]] = {"--pictures": "--images", "--no-pictures": "--no-images"}
     defaults: ClassVar[dict[str, str]] = {
-        "view": "the held-out views",
+        "view": "up to six of the held-out views",
         "output": 'SCENE/heatmaps; demo_heatmaps for "demo"',
         "threshold": "chosen for each prompt from the scene alone",
         "form": "the form of the scene",

@@ -22,15 +22,15 @@ DEMO_CONFIG = BuildConfig(clip="bundled", dino="bundled")
 """Settings of the demo; docs/results.md states on which views each setting was chosen."""
 
 
-def demo_capture(scene: CaptureName = "tabletop") -> Path:
+def demo_capture(capture: CaptureName = "tabletop") -> Path:
     """The folder of a bundled capture."""
-    return CAPTURES / scene
+    return CAPTURES / capture
 
 
 def run_demo(
     output: Path,
     *,
-    scene: CaptureName = "tabletop",
+    capture: CaptureName = "tabletop",
     method: MethodName | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     seed: int = 0,
@@ -41,7 +41,7 @@ def run_demo(
 
     Args:
         output: Scene folder to make or to resume.
-        scene: Name of the bundled capture.
+        capture: Name of the bundled capture.
         method: Method of the language; None takes the default.
         device: Device to compute on.
         seed: Seed of all randomness.
@@ -54,6 +54,6 @@ def run_demo(
     config = replace(
         DEMO_CONFIG, method=method or DEMO_CONFIG.method, device=device, seed=seed, iterations=iterations
     )
-    build(demo_capture(scene), output, config, listener=listener)
+    build(demo_capture(capture), output, config, listener=listener)
     opened = open_scene(output, device=device)
     return evaluate_scene(opened, title="lexsplat demo", listener=listener)

@@ -41,10 +41,10 @@ def read_held_out(capture: Capture, source: GroundTruthSource) -> Annotations:
     if source.masks is not None:
         remedy = "hold out the views that have ground truth: list them in test_views.json of the capture"
     if source.prompt_list is not None:
-        remedy = "leave the prompt list out, or name the masks as the released code does"
+        remedy = "leave the prompt list out, or name the files of the ground truth as the released code does"
     raise CaptureError(
         source.masks or capture.root,
-        expected="masks of held-out views to measure against",
+        expected="ground truth of held-out views",
         found=f"none in the words of the list {source.prompt_list!r}" if source.prompt_list else "none",
         remedy=remedy,
     )

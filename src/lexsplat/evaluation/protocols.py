@@ -135,7 +135,8 @@ def lerf_2d_scores(
     lies in a box, edges included. IoU: the mean of map and blurred map is stretched from its own range to -1..1,
     thresholded, and smoothed by a majority vote of 7x7 pixels. Absolute values of the map therefore have no effect.
 
-    LangSplat has three maps per prompt and takes the one with the highest peak; lexsplat has one.
+    LangSplat has three maps per prompt and takes the one with the highest peak; lexsplat has one, or one for each
+    level of 2D segments, of which it takes the best before.
 
     Args:
         relevancy: ``[H, W]`` at the size of the ground truth.

@@ -65,7 +65,8 @@ class BuildConfig:
             device.
         iterations: Reconstruction steps; by default 30,000 on CUDA and 2,000 on a CPU (3,000 with ``blocks``).
         frames: Number of frames sampled from a video.
-        test_every: Every n-th view is held out if the capture does not list held-out views; 0 holds out none.
+        test_every: Every n-th view is held out if the capture neither lists held-out views nor has views with ground
+            truth; 0 holds out none.
         up: Up direction in the axes of the cameras, as "x,y,z"; by default estimated from the cameras, or
             from splats without a capture.
         keep_floaters: Keep Gaussians that float free of all surfaces; splats without a capture lose them where there
@@ -77,7 +78,8 @@ class BuildConfig:
         joint: Train language together with geometry, as in the paper; needs method "trained".
         as_in_paper: Build and ask as the paper describes it (docs/paper.md): method "trained", jointly, 30,000 steps
             over full maps, random crops, rasterization without the mip filter, prompts relative to canonical phrases
-            with a fixed threshold. Settings that are given otherwise are kept.
+            with a fixed threshold. Settings that are given otherwise are kept. Compare and ablate train language
+            after the geometry, which their rows share.
         poses: Structure from motion, for photos without cameras and for videos.
         reconstruction: Geometry and appearance.
         features: Dense CLIP and DINO features. Settings left at their default take the value that suits the encoder

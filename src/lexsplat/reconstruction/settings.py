@@ -68,7 +68,7 @@ class ReconstructionConfig:
         noise: Strength of the noise of "mcmc", times the learning rate of the means.
         opacity_weight: Weight of the mean opacity in the loss; None is 0.01 with "mcmc", else 0.
         scale_weight: Weight of the mean standard deviation (relative to the scene) in the loss; None as above.
-        antialiased: Train and render with the mip filter.
+        antialiased: Train and render with the mip filter; --reconstruction.no-antialiased leaves it out.
         initial_opacity: Opacity of the initial Gaussians.
         warm_up: Share of the iterations, at the start, that run at half resolution; None is 0.3 in trainings
             shorter than 15,000, else 0.

@@ -1,8 +1,8 @@
 """The language feature map F of a view, and its image: the three directions in which features vary most as colors.
 
-F = p S blends the codewords S by the rendered distribution over codes p (section 3.4, Fig. 1). The image is the
-principal component analysis of the codewords, weighted by how many Gaussians carry them, so that a thing has the same
-color in every view.
+F = p S blends the codewords S by the rendered distribution over codes p (supplement B; the colors as in Fig. 1). The
+image is the principal component analysis of the codewords, weighted by how many Gaussians carry them, so that a thing
+has the same color in every view.
 """
 
 from __future__ import annotations

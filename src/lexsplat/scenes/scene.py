@@ -288,7 +288,7 @@ class Scene:
 
         Args:
             phrase: Free-text phrase.
-            view: The view that "left" and "right" refer to; None takes the one that shows the reference best.
+            view: The view that "left" and "right" refer to; None takes what most of the views that show both say.
             threshold: See `select`.
 
         Raises:

@@ -73,7 +73,7 @@ class Attempt:
         mapper: The mapper.
         model: The model, without mis-registered photos.
         models: Number of models that could not be joined.
-        all_pairs: Whether photos left over by sequential matching had been matched with all others.
+        all_pairs: Whether photos that stayed unregistered after sequential matching had been matched with all others.
     """
 
     mapper: Mapper

@@ -84,7 +84,7 @@ class PhotoPoses:
         points: Number of triangulated points.
         models: Number of models that could not be joined; the largest is kept.
         mapper: Mapper that found the model.
-        all_pairs: Whether photos left over by sequential matching were matched with all others for it.
+        all_pairs: Whether photos that sequential matching left unregistered were matched with all others for it.
         notes: Remarks for the user, one line each.
     """
 
@@ -112,7 +112,7 @@ class PhotoPoses:
             line = f"{line}, the largest of {self.models} models"
         line = f'{line}, found by the mapper "{self.mapper}"'
         if self.all_pairs:
-            line = f"{line} after all pairs of those left over were matched"
+            line = f"{line} after all pairs of the unregistered photos were matched"
         return line if not self.unregistered else f"{line}; unregistered: {', '.join(self.unregistered)}"
 
 

@@ -121,7 +121,7 @@ def _provenance(config: Mapping[str, Any], machine: Mapping[str, Any]) -> list[t
     pairs = [(name, _words(known[name])) for name in _PROVENANCE if known.get(name) is not None]
     if ground_truth := known.get("ground_truth"):
         prompt_list = ground_truth.get("prompt_list")
-        prompts = f"prompts of the list {prompt_list}" if prompt_list else "prompts of the masks"
+        prompts = f"prompts of the list {prompt_list}" if prompt_list else "prompts of the ground truth"
         pairs.append(("ground truth", f"{ground_truth.get('folder')}, {prompts}"))
     if versions := machine.get("versions"):
         pairs.append(("versions", ", ".join(f"{name} {value}" for name, value in versions.items())))

@@ -64,10 +64,11 @@ class AveragedConfig:
             count as never seen.
         prior_visibility: Weight in cells at which a Gaussian's mean is half trusted; below it u tends to 1.
         shortest_side: Views are rendered at the size of their feature maps, but not below this many pixels on the
-            short side, and reduced by at most `lexsplat.language.methods.averaging.MOST_REDUCED`.
+            short side, and reduced by at most 4.
         dino: Average DINO features, too, and compare Gaussians with codes by both halves (Eq. 4). By default a build
             does so where CLIP is read at class tokens only (`FeatureConfig.crop_tokens`), which gain by it.
-        segments: Whether to find segments (`lexsplat.language.segments`), by which questions are answered.
+        segments: Find segments (`lexsplat.language.segments`), by which questions are answered; without them,
+            Gaussians answer one by one.
     """
 
     top: int = 4

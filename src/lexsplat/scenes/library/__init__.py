@@ -5,8 +5,8 @@
     for hit in library.search("fire extinguisher").hits:
         print(hit.scene, hit.present, hit.count)
 
-Two stages: `lexsplat.scenes.library.bounds` rules out scenes by their codes alone, and the scenes that are left are
-asked themselves (`Scene.find`), so that a library and its scenes never disagree.
+`lexsplat.scenes.library.bounds` rules out scenes by their codes alone. The scenes that are left are answered from the
+index where it suffices, else by the scene itself (`Scene.find`).
 """
 
 from __future__ import annotations
