@@ -40,6 +40,9 @@ WORDS = ("vase", "teddy bear", "pumpkin", "is there a bottle?", "where is the to
 """What `Scene.find` is asked: with places, boxes and best views."""
 ASKED = ("duck", "banana", "lamp", "blue mug", "book", "griffin")
 """What `Scene.ask` is asked: scores, threshold and presence."""
+PARTS = ("mug handle", "lamp shade", "duck beak", "bear nose", "car wheel")
+KINDS = ("red thing", "purple thing", "yellow thing", "metal thing", "wooden thing", "plastic thing")
+"""Parts are cut within their thing. The first kinds of color and of material in a process take longer."""
 
 
 def copied(scene: Scene, copies: int, root: Path) -> None:
@@ -108,6 +111,8 @@ def measure(path: str, kept: str) -> dict[str, Any]:
         row[f"{name}_worst"] = max(cpu for cpu, _ in spent)
 
     median("asked", ASKED, scene.ask)
+    median("part", PARTS, scene.ask)
+    median("kind", KINDS, scene.ask)
     median("new", WORDS, lambda word: scene.find(word).to_dict())
     timed("known", lambda: [scene.find(word).to_dict() for word in WORDS])
     row["known"] = round(row["known"] / len(WORDS), 5)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from support.counting_encoders import ColorEncoder
 
-from lexsplat.features import TextCache
+from lexsplat.features import TextCache, text
 from lexsplat.runtime.files import write_tensors
 
 
@@ -131,3 +131,22 @@ def test_a_damaged_text_cache_is_replaced_and_empty_prompts_are_refused(tmp_path
     for prompts in ([], [" "]):
         with pytest.raises(ValueError, match="not empty"):
             TextCache(tmp_path).encode("color", prompts, ColorEncoder)
+
+
+def test_texts_that_follow_at_once_are_written_together_when_the_cache_is_let_go(tmp_path, monkeypatch):
+    writes = []
+    write = text.write_tensors
+    monkeypatch.setattr(
+        text, "write_tensors", lambda *given, **more: (writes.append(given), write(*given, **more))
+    )
+    cache = TextCache(tmp_path)
+    for word in ("a", "b", "c"):
+        cache.encode("color", [word], ColorEncoder)
+    assert len(writes) == 1
+    counter = ColorEncoder()
+    TextCache(tmp_path / "other").encode("color", ["b"], lambda: counter)
+    assert counter.texts == 1
+    del cache
+    assert len(writes) == 3
+    TextCache(tmp_path).encode("color", ["a", "b", "c"], lambda: counter)
+    assert counter.texts == 1

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
+import time
+import weakref
 from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
@@ -25,6 +28,8 @@ _MAX_STORED = 10_000
 """Texts in one file, at most; the ones that came first are forgotten."""
 _MAX_LENGTH = 1_000
 """Characters of a stored text, at most; longer ones are encoded each time."""
+_WRITES_APART = 10.0
+"""Seconds between two writes of a file, at least: it is written whole, 20 MB where it is full."""
 
 
 class TextTower(Protocol):
@@ -88,7 +93,8 @@ def encode_each(encoder: TextTower, texts: Sequence[str], listener: Listener = s
 class TextCache:
     """Embeddings of prompts by model and prompt, in one or more folders.
 
-    A folder has one file per model, ``text-HASH.safetensors``, which is read once. A damaged file counts as empty.
+    A folder has one file per model, ``text-HASH.safetensors``, which is read once. A damaged file counts as empty. New
+    texts are written at once, or within `_WRITES_APART` of the last write when the cache is let go or the process ends.
 
     Args:
         *folders: Folders of the files; created on the first write. What is asked is kept in each that can be written.
@@ -147,12 +153,15 @@ class _Store:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._known: dict[str, dict[str, Tensor]] = {}
+        self._written: dict[str, float] = {}
+        self._unwritten: set[str] = set()
+        weakref.finalize(self, _write_rest, folder, self._known, self._unwritten)
 
     def read(self, content_hash: str) -> dict[str, Tensor]:
         """The stored embeddings by text."""
         if content_hash not in self._known:
             try:
-                self._known[content_hash] = _read(self._path(content_hash))
+                self._known[content_hash] = _read(_path(self._folder, content_hash))
             except (FileFormatError, KeyError, ValueError, RecursionError):
                 self._known[content_hash] = {}  # a damaged cache counts as empty
         return self._known[content_hash]
@@ -171,15 +180,32 @@ class _Store:
         known.update(new)
         for text in list(known)[:-_MAX_STORED]:
             del known[text]
-        try:
-            stored = torch.stack(list(known.values()))
-            facts = {"texts": json.dumps(list(known)), "width": str(width)}
-            write_tensors(self._path(content_hash), {"embeddings": stored}, facts, lasting=False)
-        except OSError as error:  # the cache is optional
-            log.warning("%s: text embeddings are not cached (%s)", self._folder, error.strerror)
+        if time.monotonic() < self._written.get(content_hash, -math.inf) + _WRITES_APART:
+            self._unwritten.add(content_hash)
+            return
+        _write(self._folder, content_hash, known)
+        self._unwritten.discard(content_hash)
+        self._written[content_hash] = time.monotonic()
 
-    def _path(self, content_hash: str) -> Path:
-        return self._folder / f"text-{content_hash}.safetensors"
+
+def _path(folder: Path, content_hash: str) -> Path:
+    return folder / f"text-{content_hash}.safetensors"
+
+
+def _write(folder: Path, content_hash: str, known: dict[str, Tensor]) -> None:
+    try:
+        vectors = torch.stack(list(known.values()))
+        facts = {"texts": json.dumps(list(known)), "width": str(vectors.shape[1])}
+        write_tensors(_path(folder, content_hash), {"embeddings": vectors}, facts, lasting=False)
+    except OSError as error:  # the cache is optional
+        log.warning("%s: text embeddings are not cached (%s)", folder, error.strerror)
+
+
+def _write_rest(folder: Path, known: dict[str, dict[str, Tensor]], unwritten: set[str]) -> None:
+    """Write what waits, unless its folder has gone."""
+    for content_hash in sorted(unwritten):
+        if folder.is_dir():
+            _write(folder, content_hash, known[content_hash])
 
 
 def _read(path: Path) -> dict[str, Tensor]:
