@@ -93,8 +93,9 @@ def encode_each(encoder: TextTower, texts: Sequence[str], listener: Listener = s
 class TextCache:
     """Embeddings of prompts by model and prompt, in one or more folders.
 
-    A folder has one file per model, ``text-HASH.safetensors``, which is read once. A damaged file counts as empty. New
-    texts are written at once, or within `_WRITES_APART` of the last write when the cache is let go or the process ends.
+    A folder has one file per model, ``text-HASH.safetensors``, which is read once. A damaged file counts as empty.
+    New texts are written at once. Those that follow within `_WRITES_APART` seconds wait for the next write, or until
+    the cache is let go or the process ends.
 
     Args:
         *folders: Folders of the files; created on the first write. What is asked is kept in each that can be written.
