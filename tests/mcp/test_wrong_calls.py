@@ -79,6 +79,12 @@ HOSTILE = [  # tool, arguments, subject of the error, what its line tells
     ),
     ("relate", {"first": "mug", "relation": "behnd", "second": "mug"}, "relation", "did you mean 'behind'?"),
     (
+        "relate",
+        {"first": "mug", "relation": "beside", "second": "mug"},
+        "relation",
+        "did you mean 'next to'?",
+    ),
+    (
         "render",
         {"phrases": "mug"},
         "phrases",

@@ -112,6 +112,11 @@ def test_masks_are_checked_before_features_are_searched(tmp_path):
     assert "poses" not in stages
 
 
+def test_photos_that_become_too_small_are_refused_before_structure_from_motion(photos, tmp_path):
+    config = replace(CONFIG, downscale=1000.0)
+    refused(photos, tmp_path / "out", "at least 6 pixels a side", "smaller --downscale", config=config)
+
+
 def test_splats_need_cameras(photos, tmp_path):
     refused(photos, tmp_path / "out", "without cameras", splats=BUNDLED_SCENE / "gaussians.ply")
 

@@ -1,6 +1,7 @@
 """From photos alone, or a video, to a scene: by the command line, twice, and found again for evaluation."""
 
 import json
+import logging
 import os
 import shutil
 from fractions import Fraction
@@ -61,11 +62,22 @@ def test_photos_alone_become_a_scene_of_upright_views(photos, room_scene):
     assert record["capture"] == str(photos)
     assert record["stages"]["poses"]["registered"] == COUNT
     assert record["stages"]["poses"]["unregistered"] == ["unrelated.png"]
+    assert record["stages"]["poses"]["models"] == 1
+    note = next(warning for warning in record["warnings"] if "photos registered" in warning)
+    assert f"{COUNT} of {COUNT + 1} photos registered" in note
+    assert "unregistered: unrelated.png" in note
+    assert any("training photos are few" in warning for warning in record["warnings"])
     views = SceneFolder.open(room_scene).read_cameras()
     assert {name: view.split for name, view in views.items()} == {
         f"{index}.jpg": "test" if index == 3 else "train" for index in range(COUNT)
     }, "the photo with ground truth is held out"
     assert_same_up_to_a_similarity([views[f"{index}.jpg"].camera for index in range(COUNT)], room_cameras())
+
+
+def test_a_finished_build_says_again_what_it_warned_of(photos, room_scene, caplog):
+    assert run("reconstruct", photos, room_scene) == 0
+    warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert warned == json.loads((room_scene / "scene.json").read_text())["warnings"]
 
 
 def test_reloading_finds_photos_ground_truth_and_masks(photos, room_scene, tmp_path):

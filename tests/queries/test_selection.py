@@ -1,5 +1,7 @@
 """Sets of Gaussians: compared with sets of numbers, brute-force distances and balls at known places."""
 
+import operator
+
 import numpy as np
 import pytest
 import torch
@@ -78,6 +80,10 @@ def test_presence_of_combinations_is_that_of_the_words(balls):
     assert [(yes | no).present, (yes & no).present, (yes - no).present, (no - yes).present] == [
         "yes", "no", "yes", "no",
     ]  # fmt: skip
+    other = ball(balls, 2)
+    assert [(yes & other).present, (yes - yes).present, (yes | other).present] == ["no", "no", "yes"], (
+        "nothing is left"
+    )
 
 
 @pytest.mark.parametrize("distance", [0.05, 0.3, 1.2])
@@ -127,6 +133,11 @@ def test_one_gaussian_is_an_instance(balls):
 def test_masks_of_another_scene_are_refused(balls):
     with pytest.raises(ValueError, match="mask must be bool"):
         Selection(balls.gaussians, {}, torch.zeros(3, dtype=torch.bool), torch.zeros(3))
+    few = balls.gaussians.select(torch.arange(3))
+    other = Selection(few, {}, torch.ones(3, dtype=torch.bool), torch.ones(3))
+    for combine in (operator.or_, operator.and_, operator.sub):
+        with pytest.raises(ValueError, match="different scenes"):
+            combine(ball(balls, 0), other)
 
 
 def test_plain_data_counts_instances_and_lists_none_of_what_is_not_there(balls):

@@ -277,3 +277,50 @@ def test_a_saved_edit_is_a_scene(base, tmp_path):
     assert saved.folder.record["edits"] == ["delete balls (0,) (30 Gaussians)"]
     with pytest.raises(SceneFolderError, match="exists"):
         editor.save(tmp_path / "saved")
+
+
+def test_two_editors_of_one_journal_do_not_overwrite_each_other(base, tmp_path):
+    scene, _ = base
+    path = tmp_path / "edits.jsonl"
+    first, second = Editor(scene, path), Editor(scene, path)
+    first.delete(choose(first, 0))
+    content = path.read_bytes()
+    with pytest.raises(SceneFolderError, match="steps of another program"):
+        second.delete(choose(second, 1))
+    assert path.read_bytes() == content
+    assert same(second.scene, scene), "nothing has changed"
+    assert len(Editor(scene, path).steps) == 1
+    path.unlink()  # as "discard" does
+    with pytest.raises(SceneFolderError, match="steps of another program"):
+        first.delete(choose(first, 2))
+    assert not path.exists()
+
+
+@pytest.fixture(scope="module")
+def demo():
+    return open_scene("demo", device="cpu")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "motion", [Motion(scale=3.0), Motion((6.0, 0, 0))], ids=["enlarged", "out of all photos"]
+)
+def test_a_moved_thing_is_found_whole_where_it_is_now(demo, tmp_path, motion):
+    """By its visible weight for its new size and place it would be hidden from the photos."""
+    editor, before = Editor(demo), demo.find("mug")
+    editor.move(before, motion, fill=False)
+    for scene in (editor.scene, open_scene(editor.save(tmp_path / "moved").root, device="cpu")):
+        found = scene.find("mug")
+        assert (found.present, found.count) == ("yes", 1)
+        assert len(found) == len(before)
+        assert np.allclose(found.center, before.center + motion.translation, atol=0.1)
+
+
+@pytest.mark.slow
+def test_things_keep_their_sizes_when_another_one_is_deleted(demo):
+    editor = Editor(demo)
+    editor.delete(demo.find("banana"))
+    for name in ("lamp", "rubber duck"):
+        now, before = editor.scene.find(name), demo.find(name)
+        assert len(now) == len(before)
+        assert np.allclose(now.box.half_sizes, before.box.half_sizes, atol=1e-6)

@@ -11,7 +11,7 @@ from support.language_scene import CENTERS, RADIUS
 from support.library_scenes import OTHERS, THINGS, copied, install, write_scene
 
 import lexsplat
-from lexsplat import open_scene
+from lexsplat import cli, open_scene
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.phrases import Thing
 from lexsplat.queries.vocabulary import default_vocabulary
@@ -192,6 +192,13 @@ def test_a_scale_that_was_set_after_adding_gives_meters(segmented_copy):
         [side / 2 for side in before["size"]], abs=1e-4
     )
     assert "m." in repr(hit)
+
+
+def test_boxes_stand_upright_after_the_up_direction_was_set(segmented_copy):
+    assert cli.main(["scale", str(segmented_copy / "kitchen"), "--up", "1,0,0"]) == 0
+    hit = Library(segmented_copy / "library").search("mug").hits[0].to_dict()
+    assert hit["up"]["direction"] == pytest.approx([1, 0, 0])
+    assert hit["instances"][0]["axes"][2] == pytest.approx([1, 0, 0], abs=1e-4)
 
 
 def test_entries_of_a_library_without_segments_answer_by_their_scenes(segmented_copy):

@@ -79,6 +79,20 @@ def test_on_a_computer_the_box_and_the_panels_stay(page):
     assert page.locator(".objects").is_visible()
 
 
+def test_opening_one_list_closes_the_other(page):
+    page.evaluate(LIST)
+    objects, views = (
+        page.locator(".tools").get_by_label(name) for name in ("Objects in", "Where the photos")
+    )
+    for opened, other in ((objects, views), (views, objects), (objects, views)):
+        opened.click()
+        assert (opened.get_attribute("aria-pressed"), other.get_attribute("aria-pressed")) == (
+            "true",
+            "false",
+        )
+        assert page.locator("aside.views").filter(visible=True).count() == 1
+
+
 def test_the_threshold_is_dragged_with_a_pause_and_the_color_stays_under_the_hand(page):
     ask(page, "ball 2")
     slider = page.locator(".threshold input")

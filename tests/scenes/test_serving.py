@@ -15,7 +15,7 @@ from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.answers import answer_queries, find_phrase
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.scene import open_scene
-from lexsplat.scenes.serving import MAX_LINE, OpenScene, answer_line, json_line, lines_of
+from lexsplat.scenes.serving import MAX_LINE, OpenScene, answer_line, json_line, lines_of, open_scenes
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "schemas" / "ask.json").read_text())
 
@@ -23,6 +23,10 @@ SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "schemas" / "ask.json"
 @pytest.fixture(scope="module")
 def served_demo():
     return OpenScene("demo")
+
+
+def test_a_name_that_a_library_has_is_given_to_no_other_scene():
+    assert list(open_scenes(["demo"], taken=["demo", "demo-2"])) == ["demo-3"]
 
 
 def test_what_was_used_least_recently_is_forgotten():

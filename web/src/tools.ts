@@ -10,8 +10,15 @@ import { changeTheme } from "./theme";
 export function toolbar(app: App, signal: AbortSignal): HTMLElement {
   const press = (button: HTMLButtonElement, on: boolean): void => button.setAttribute("aria-pressed", String(on));
   const { manifest, server } = app;
-  const views = iconButton("views", "Where the photos were taken", () => press(views, app.views.toggle()), "v");
-  const objects = iconButton("objects", "Objects in this scene", () => press(objects, app.objects.toggle()), "o");
+  // Both lists stand in one place: opening one closes the other.
+  const views = iconButton("views", "Where the photos were taken", () => {
+    press(views, app.views.toggle());
+    if (!app.views.element.hidden && !app.objects.element.hidden) press(objects, app.objects.toggle());
+  }, "v");
+  const objects = iconButton("objects", "Objects in this scene", () => {
+    press(objects, app.objects.toggle());
+    if (!app.objects.element.hidden && !app.views.element.hidden) press(views, app.views.toggle());
+  }, "o");
   const measure = iconButton("measure", "Measure between two points", () => {
     press(measure, app.measure.toggle());
     app.note(app.measure.active ? "Click on two points." : "");

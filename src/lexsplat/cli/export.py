@@ -61,7 +61,7 @@ class Export:
         """Write the file."""
         with starting():
             from lexsplat.geometry.world import world_of
-            from lexsplat.scenes.exporting import ending_of, export_gaussians, export_scene
+            from lexsplat.scenes.exporting import ending_of, export_gaussians, export_scene, exported
 
         ending_of(self.file)
         folder = open_folder(self.scene)
@@ -75,8 +75,8 @@ class Export:
                 dataclasses.replace(scene.find(phrase, self.view, threshold=self.threshold), phrase=phrase)
                 for phrase in self.select
             ]
-            for selection in found:
-                print(f"{selection.phrase}: {len(selection):,} Gaussians{PRESENCE[selection.present]}")
+            for thing in exported(scene, self.file, found):
+                print(f"{thing.phrase}: {len(thing):,} Gaussians{PRESENCE[thing.present]}")
             with uncounted(scene.listener, "export"):
                 files = export_scene(scene, self.file, found=found, language=self.language, overwrite=True)
         else:

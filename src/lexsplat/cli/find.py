@@ -73,9 +73,10 @@ def _print_answer(answer: dict[str, Any]) -> None:
     for number, thing in enumerate(answer["instances"], start=1):
         center = ", ".join(f"{v:.2f}" for v in thing["center"])
         size = " x ".join(f"{v:.2f}" for v in thing["size"])
+        unit = ""
         if thing.get("size_meters") is not None:
-            size = " x ".join(f"{v:.3f}" for v in thing["size_meters"]) + " m"
+            size, unit = " x ".join(f"{v:.3f}" for v in thing["size_meters"]) + " m", " scene units"
         print(
-            f"  {number}. {shortened(thing['name'], 60)} at ({center}), size {size}, score {thing['score']:.2f}, "
-            f"{thing['gaussians']} Gaussians, best seen in {thing['best_view']}"
+            f"  {number}. {shortened(thing['name'], 60)} at ({center}){unit}, size {size}, "
+            f"score {thing['score']:.2f}, {thing['gaussians']} Gaussians, best seen in {thing['best_view']}"
         )

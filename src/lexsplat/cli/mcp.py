@@ -124,4 +124,5 @@ class Mcp:
                 library = open_library(libraries[0], device=self.device)
             library.listener = listener
         alone = [path for path in self.scenes if path not in libraries]
-        return open_scenes(alone, self.device, self.clip, listener), library
+        taken = library.names() if library is not None else ()
+        return open_scenes(alone, self.device, self.clip, listener, taken), library

@@ -94,6 +94,8 @@ def evaluate_scene(
         settings={
             **record.get("config", {}),
             "ground_truth": found.origin_facts(prompt_list) if found.masks else None,
+            **_registration(record),
+            "warnings": record.get("warnings", []),
         },
         machine=machine_facts(),
     )
@@ -117,6 +119,12 @@ def _write_results(root: Path, metrics: Metrics, gallery: Gallery, title: str) -
         path = root / "heatmaps" / file_name(prompt) / stem.with_name(stem.name + ".jpg")
         with atomic_path(path) as temporary:
             temporary.write_bytes(images["heatmap"])
+
+
+def _registration(record: dict[str, Any]) -> dict[str, str]:
+    """How many photos structure from motion registered, which not, and by which mapper."""
+    note = record["stages"].get("poses", {}).get("note")
+    return {"photos": note} if note else {}
 
 
 def _prompt_kinds(root: Path) -> dict[str, str]:

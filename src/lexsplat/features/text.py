@@ -148,6 +148,12 @@ class TextCache:
         return torch.stack([found[prompt] for prompt in prompts])
 
 
+    def write(self) -> None:
+        """Write the texts that wait."""
+        for store in self._written:
+            store.write()
+
+
 class _Store:
     """The files of one folder. A folder that cannot be written is only read."""
 
@@ -188,6 +194,10 @@ class _Store:
         self._unwritten.discard(content_hash)
         self._written[content_hash] = time.monotonic()
 
+    def write(self) -> None:
+        """Write the texts that wait."""
+        _write_rest(self._folder, self._known, self._unwritten)
+
 
 def _path(folder: Path, content_hash: str) -> Path:
     return folder / f"text-{content_hash}.safetensors"
@@ -207,6 +217,7 @@ def _write_rest(folder: Path, known: dict[str, dict[str, Tensor]], unwritten: se
     for content_hash in sorted(unwritten):
         if folder.is_dir():
             _write(folder, content_hash, known[content_hash])
+    unwritten.clear()
 
 
 def _read(path: Path) -> dict[str, Tensor]:

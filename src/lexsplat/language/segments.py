@@ -59,11 +59,14 @@ class Segments:
         labels: Segment of each Gaussian at the lowest level ``[N]`` int64, in 0..S-1.
         masses: Visible weight of each Gaussian over the training views ``[N]`` float32, in cells; not negative.
         levels: Segment at each level of each lowest segment ``[L, S]`` int64, the lowest level first.
+        hidden: Gaussians that the training views hardly show ``[N]`` bool, where they are not as geometry and masses
+            say, as after an edit; None leaves that to `lexsplat.queries.visibility`.
     """
 
     labels: Tensor
     masses: Tensor
     levels: Tensor
+    hidden: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.labels.ndim != 1 or self.masses.shape != self.labels.shape or self.levels.ndim != 2:
@@ -78,6 +81,8 @@ class Segments:
                 raise ValueError(f"{name} must be in 0..{self.levels.shape[1] - 1}")
         if self.masses.numel() and float(self.masses.min()) < 0:
             raise ValueError("masses must not be negative")
+        if self.hidden is not None and self.hidden.shape != self.labels.shape:
+            raise ValueError(f"hidden [N] expected, got {list(self.hidden.shape)}")
 
     def __repr__(self) -> str:
         levels, lowest = self.levels.shape
@@ -85,16 +90,18 @@ class Segments:
 
     def select(self, index: Tensor) -> Segments:
         """The segments of some Gaussians, with the same numbers."""
-        return Segments(self.labels[index], self.masses[index], self.levels)
+        hidden = None if self.hidden is None else self.hidden[index]
+        return Segments(self.labels[index], self.masses[index], self.levels, hidden)
 
     def tensors(self) -> dict[str, Tensor]:
         """For safetensors: 4 bytes a Gaussian if there are at most 65,536 segments."""
         small = self.levels.shape[1] <= 1 << 16
-        return {
+        found = {
             _PREFIX + "labels": self.labels.to(torch.uint16 if small else torch.int32),
             _PREFIX + "masses": self.masses.clamp(max=6e4).half(),
             _PREFIX + "levels": self.levels.to(torch.int32),
         }
+        return found if self.hidden is None else {**found, _PREFIX + "hidden": self.hidden.to(torch.uint8)}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Segments | None:
@@ -109,7 +116,13 @@ class Segments:
             return None
         if len(found) < len(names):
             raise ValueError(f"segments lack {', '.join(name for name in names if name not in found)}")
-        return cls(found["labels"].long(), found["masses"].float(), found["levels"].long())
+        hidden = tensors.get(_PREFIX + "hidden")
+        return cls(
+            found["labels"].long(),
+            found["masses"].float(),
+            found["levels"].long(),
+            None if hidden is None else hidden.bool(),
+        )
 
 
 Rows = Callable[[slice | Tensor], Tensor]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import reprlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from pydantic import ValidationError
 
+from lexsplat.queries.patterns import RELATIONS
 from lexsplat.runtime.errors import QueryError
 
 NOT_BLANK = r"\S"
@@ -81,6 +83,10 @@ def wrong_value(error: ValidationError, schema: Schema) -> QueryError:
 
 def nearest(name: str, names: Iterable[str], otherwise: str = "") -> str:
     """A remedy: the name that is meant."""
+    names = list(names)
+    for words, relation in RELATIONS:
+        if relation in names and re.fullmatch(words, name.strip().lower()):
+            return f"did you mean {relation!r}?"
     close = difflib.get_close_matches(name[:_SHOWN].lower(), list(names), n=1)
     return f"did you mean {close[0]!r}?" if close else otherwise
 

@@ -15,7 +15,7 @@ from lexsplat.mcp import answers
 from lexsplat.mcp.tools import PhraseText, Reply, SceneName, Tools, asked_of
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.scenes.editing import Editor
-from lexsplat.scenes.exporting import ending_of, export_scene
+from lexsplat.scenes.exporting import ending_of, export_scene, exported
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.serving import OpenScene, counted, qualified, sentence, shortened
 
@@ -44,13 +44,10 @@ class WritingTools(Tools):
         found, asked = asked_of(place, phrase)
         with _writing(path):
             files = export_scene(place, path, found=[replace(found, phrase=phrase)])
-        written = [str(each) for each in files]
-        text = (
-            f"{counted(len(found), 'Gaussian')} of {shortened(asked['understood'])} written to {written[0]}."
-        )
+        written, count = [str(each) for each in files], len(exported(place, path, [found])[0])
+        text = f"{counted(count, 'Gaussian')} of {shortened(asked['understood'])} written to {written[0]}."
         return Reply(
-            qualified(text, asked),
-            {**place.world.to_json(), **asked, "files": written, "gaussians": len(found)},
+            qualified(text, asked), {**place.world.to_json(), **asked, "files": written, "gaussians": count}
         )
 
     def edit(
@@ -89,6 +86,7 @@ class WritingTools(Tools):
             editor.recolor(found, color)
         else:
             getattr(editor, action)(found)
+        count = int(editor.steps[-1].mask.sum())
         with _writing(path):
             saved = editor.save(path)
         document = {
@@ -96,10 +94,10 @@ class WritingTools(Tools):
             **asked,
             "scene": str(saved.root),
             "action": action,
-            "gaussians": len(found),
+            "gaussians": count,
         }
         what = f"{shortened(asked['understood'])}{' (unsure)' if asked['present'] == 'unsure' else ''}"
-        text = f"{action} {what}: {counted(len(found), 'Gaussian')}; the result is the scene {saved.root}."
+        text = f"{action} {what}: {counted(count, 'Gaussian')}; the result is the scene {saved.root}."
         return Reply(text + (f" Note: {asked['note']}." if asked["note"] else ""), document)
 
     def _new(self, argument: str, name: str) -> Path:

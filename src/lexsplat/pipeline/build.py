@@ -30,7 +30,13 @@ from lexsplat.pipeline.inputs import (
     refuse_without_cameras,
     survey_photos,
 )
-from lexsplat.pipeline.provenance import features_identity, model_place, with_full_paths, write_provenance
+from lexsplat.pipeline.provenance import (
+    features_identity,
+    model_place,
+    record_warnings,
+    with_full_paths,
+    write_provenance,
+)
 from lexsplat.pipeline.splats import existing_splats
 from lexsplat.pipeline.viewpoints import capture_of_splats
 from lexsplat.pipeline.viewpoints.choosing import SIZE
@@ -46,7 +52,7 @@ from lexsplat.runtime.errors import (
 )
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Event, Listener, kept_warnings, silent, warn_again
 from lexsplat.runtime.training import Checkpoint
 from lexsplat.runtime.workers import IN_PROCESS, SharedFolder, Workers, open_workers
 from lexsplat.scenes.folder import SceneFolder
@@ -237,15 +243,19 @@ class _Builder:
     def _run_stage(self, name: str, stage: _Stage) -> None:
         key = self.fingerprints[name] = self._fingerprint(stage)
         if self._is_finished(name, stage):
+            warn_again(self.folder.record["stages"][name])
             self.listener(Event(name, 1, 1, {"kept": 1.0}))
             return
         self.folder.reopen(name)
         start = time.perf_counter()
         path = self._checkpoints / f"{name}.training.safetensors"
         self.checkpoint = Checkpoint(path, key, every=self.config.checkpoint_seconds)
-        facts = stage.work()
+        with kept_warnings() as warnings:
+            facts = stage.work()
         seconds = self.checkpoint.seconds_before + time.perf_counter() - start
-        self.folder.finish(name, key, seconds, **facts)
+        self.folder.finish(name, key, seconds, **facts, **({"warnings": warnings} if warnings else {}))
+        record_warnings(self.folder, self.capture)
+        self.folder.save()
         self.checkpoint.remove()
         if name == "reconstruct":  # also visits of an earlier command with other --blocks
             shutil.rmtree(self._checkpoints / "blocks", ignore_errors=True)

@@ -42,7 +42,7 @@ from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError, SceneFolderError
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.runtime.progress import NOTE, Listener
+from lexsplat.runtime.progress import NOTE, Listener, kept_warnings, warn_again
 from lexsplat.scenes.folder import SceneFolder
 
 log = logging.getLogger("lexsplat")
@@ -172,7 +172,10 @@ def survey_photos(
         return PhotoSurvey(config.frames, _VIDEO_SIZE)
     load_annotations(capture)
     check_given_maps(config, capture)
-    return PhotoSurvey(len(capture.train_names), _largest(capture))
+    largest = _largest(capture)
+    if config.downscale is not None:
+        _check_size(source, round(largest[0] / config.downscale), round(largest[1] / config.downscale))
+    return PhotoSurvey(len(capture.train_names), largest)
 
 
 def check_given_maps(config: BuildConfig, capture: Capture) -> None:
@@ -236,21 +239,28 @@ def _registered_images(
     images = folder.record["stages"].get("poses", {}).get("images")
     kept = images is not None and (folder.root / images).is_dir() and (poses / "sparse" / "0").is_dir()
     if kept and folder.is_finished("poses", key):
+        warn_again(folder.record["stages"]["poses"])
         return str(images)
     start = time.perf_counter()
     folder.reopen("poses")
     if is_video(source):
         sample_video(source, photos, config.frames, memory=memory, listener=listener)
-    found = poses_from_photos(photos, poses, config.poses, seed=config.seed, memory=memory, listener=listener)
-    for note in found.notes:
-        log.warning(note)
-    log.log(NOTE if found.is_complete else logging.WARNING, found.note)
+    with kept_warnings() as warnings:
+        found = poses_from_photos(
+            photos, poses, config.poses, seed=config.seed, memory=memory, listener=listener
+        )
+        for note in found.notes:
+            log.warning(note)
+        log.log(NOTE if found.is_complete else logging.WARNING, found.note)
     inside = found.images.resolve().is_relative_to(folder.root.resolve())
     images = "poses/images" if inside else str(found.images.resolve())
     facts = {
         "registered": len(found.registered),
         "unregistered": list(found.unregistered),
         "mapper": found.mapper,
+        "models": found.models,
+        "note": found.note,
+        "warnings": warnings,
         "images": images,
     }
     folder.finish("poses", key, time.perf_counter() - start, **facts)
@@ -327,15 +337,20 @@ def check_photos(capture: Capture, memory: int) -> None:
         CaptureError: If a photo is too small at the size to work at.
         MemoryBudgetError: If a photo does not fit.
     """
-    from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
-
     for view in capture.views.values():
         width, height = view.camera.width, view.camera.height
-        if min(width, height) < SMALLEST_SIDE:
-            raise CaptureError(
-                view.image_path,
-                expected=f"at least {SMALLEST_SIDE} pixels a side to work on",
-                found=f"{width}x{height}",
-                remedy="give a smaller --downscale, or larger photos",
-            )
+        _check_size(view.image_path, width, height)
         budget.check_photo((view.lens.width, view.lens.height), memory, (width, height))
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    """Refuse photos that are too small at the size to work at."""
+    from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
+
+    if min(width, height) < SMALLEST_SIDE:
+        raise CaptureError(
+            path,
+            expected=f"at least {SMALLEST_SIDE} pixels a side to work on",
+            found=f"{width}x{height}",
+            remedy="give a smaller --downscale, or larger photos",
+        )

@@ -55,11 +55,19 @@ def write_provenance(folder: SceneFolder, capture: Capture, config: BuildConfig)
         "seed": config.seed,
         "sources": sources,
     }
-    chosen = folder.record["stages"]["views"]["warnings"] if is_of_chosen_views(folder.record) else []
-    folder.record["warnings"] = [*capture.warnings, *chosen]
+    record_warnings(folder, capture)
     folder.save()
     cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), s] for n, (c, s) in views.items()}
     return fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
+
+
+def record_warnings(folder: SceneFolder, capture: Capture) -> None:
+    """Gather the warnings of the capture and of the stages that are done; `SceneFolder.save` writes them."""
+    stages = dict(folder.record["stages"])
+    if not is_of_chosen_views(folder.record):
+        stages.pop("views", None)  # of an earlier build
+    of_stages = [warning for stage in stages.values() for warning in stage.get("warnings", ())]
+    folder.record["warnings"] = list(dict.fromkeys([*capture.warnings, *of_stages]))
 
 
 def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]) -> None:

@@ -69,6 +69,9 @@ class Seen:
     @cached_property
     def hidden(self) -> Tensor:
         """Gaussians ``[N]`` bool that the training views hardly show (`lexsplat.queries.visibility`)."""
+        known = self._segments.hidden
+        if known is not None:
+            return known.to(self._gaussians.device)
         return hidden_gaussians(self._gaussians, self._training, self._segments.masses)
 
     @property

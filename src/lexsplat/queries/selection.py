@@ -7,7 +7,7 @@ its *instances*: two mugs found by "mug" are one selection with two instances, a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -216,13 +216,13 @@ class Selection:
     # -- making others from it
 
     def __or__(self, other: Selection) -> Selection:
-        return self._combined(other, self.mask | other.mask, "or")
+        return self._combined(other, "or", torch.bitwise_or)
 
     def __and__(self, other: Selection) -> Selection:
-        return self._combined(other, self.mask & other.mask, "and")
+        return self._combined(other, "and", torch.bitwise_and)
 
     def __sub__(self, other: Selection) -> Selection:
-        return self._combined(other, self.mask & ~other.mask, "minus")
+        return self._combined(other, "minus", lambda own, others: own & ~others)
 
     def __invert__(self) -> Selection:
         return replace(
@@ -340,12 +340,16 @@ class Selection:
         """The `sample`, for the search of neighbors."""
         return cKDTree(self.sample)
 
-    def _combined(self, other: Selection, mask: Tensor, word: str) -> Selection:
+    def _combined(
+        self, other: Selection, word: str, combine: Callable[[Tensor, Tensor], Tensor]
+    ) -> Selection:
         if len(self.mask) != len(other.mask):
             raise ValueError("the selections are of different scenes")
+        mask = combine(self.mask, other.mask)
         scores = self.scores if word == "minus" else torch.maximum(self.scores, other.scores)
         ranks = [PRESENCES.index(self.present), PRESENCES.index(other.present)]
         present = {"or": max(ranks), "and": min(ranks), "minus": ranks[0]}[word]
+        present = present if word == "or" or bool(mask.any()) else PRESENCES.index("no")
         phrase = f"{self.phrase} {word} {other.phrase}".strip()
         threshold = min(self.threshold, other.threshold) if word == "or" else self.threshold
         return replace(

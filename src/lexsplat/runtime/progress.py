@@ -141,3 +141,22 @@ class FirstUnits:
         if seconds >= self._ENOUGH and 0 < done <= total / 2 and not self._told:
             self._told = True
             tell(self._stage, seconds / done * total, f"{total:,} {self._units}")
+
+
+@contextmanager
+def kept_warnings() -> Iterator[list[str]]:
+    """The warnings of lexsplat in this block, which are shown as well."""
+    found: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: found.append(record.getMessage())  # type: ignore[method-assign]
+    log.addHandler(handler)
+    try:
+        yield found
+    finally:
+        log.removeHandler(handler)
+
+
+def warn_again(stage: Mapping[str, Any]) -> None:
+    """Show the warnings of a stage that an earlier command finished, from its record."""
+    for warning in stage.get("warnings", ()):
+        log.warning("%s", warning)

@@ -123,7 +123,8 @@ class Answers:
         selection = selection.without_specks()
         if self.automatic:
             selection = selection.convincing(self.words[index].own if self.words else None)
-        return without_hidden(selection, self.scene.hidden)
+        shown = without_hidden(selection, self.scene.hidden)
+        return replace(shown, note="no photo shows what fits") if selection and not shown else shown
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON: ``{"answers": [...]}``, each as `Selection.to_dict`."""

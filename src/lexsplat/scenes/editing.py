@@ -7,6 +7,7 @@ new scene folder. The rows of the language field follow their Gaussians, and vie
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -88,7 +89,10 @@ def _without(
     tensors: dict[str, Any] = {
         name: torch.cat([tensor, getattr(added, name)]) for name, tensor in remain.tensors().items()
     }
-    return replace(remain, **tensors), language.select(torch.cat([kept.nonzero()[:, 0], sources]))
+    language = language.select(torch.cat([kept.nonzero()[:, 0], sources]))
+    if language.segments is not None and language.segments.hidden is not None:
+        language.segments.hidden[len(remain) :] = False
+    return replace(remain, **tensors), language
 
 
 def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> Gaussians:
@@ -150,6 +154,19 @@ class Motion:
         }
         numbers = {name: np.asarray(value, float).tolist() for name, value in vectors.items()}
         return {**numbers, "scale": float(self.scale)}
+
+
+def _with_hidden(scene: Scene) -> LanguageField:
+    """The language of a scene with the Gaussians that its photos hide, which no edit shows or hides.
+
+    By their masses, a thing would be hidden once it is enlarged, and where no photo was taken.
+    """
+    segments = scene.field.segments
+    if segments is None or segments.hidden is not None:
+        return scene.field
+    field = copy.copy(scene.field)
+    field.segments = replace(segments, hidden=scene.hidden.to(segments.labels.device))
+    return field
 
 
 class Editor:
@@ -330,14 +347,14 @@ class Editor:
             raise FileFormatError(
                 self.journal.path if self.journal else "edit",
                 expected="steps that can be replayed",
-                found=repr(error)[:200],
+                found=str(error)[:200],
                 remedy="discard the edit",
             ) from error
 
     def _advance(self, step: Step) -> None:
         if len(self.scene.gaussians) > MAX_GROWTH * max(len(self.original.gaussians), 1):
             raise ValueError(f"edits may grow a scene to at most {MAX_GROWTH} times its Gaussians")
-        self.scene = self.scene.with_content(*apply(step, self.scene.gaussians, self.scene.field))
+        self.scene = self.scene.with_content(*apply(step, self.scene.gaussians, _with_hidden(self.scene)))
         self.steps.append(step)
 
     def _replay(self) -> None:

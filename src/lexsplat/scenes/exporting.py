@@ -154,9 +154,7 @@ def export_scene(
     stored = stored_language(scene.field, scene.encoder_identity()) if language else None
     gaussians = scene.gaussians
     if found:
-        segments = scene.field.segments
-        things = [whole_things(selection, scene.hidden, segments) for selection in found]
-        mask = torch.stack([thing.mask for thing in things]).any(0)
+        mask = torch.stack([thing.mask for thing in exported(scene, path, found)]).any(0)
         if not mask.any():
             raise QueryError(
                 ", ".join(selection.phrase for selection in found),
@@ -167,6 +165,13 @@ def export_scene(
         gaussians = gaussians.select(mask)
         stored = stored.select(mask.cpu()) if stored else None
     return export_gaussians(gaussians, path, language=stored, world=scene.world, overwrite=overwrite)
+
+
+def exported(scene: Scene, path: Path, found: Sequence[Selection]) -> list[Selection]:
+    """What a file holds of selections: in a splat format their things with what is hidden in them."""
+    if ending_of(path) in LABEL_ENDINGS:
+        return list(found)
+    return [whole_things(selection, scene.hidden, scene.field.segments) for selection in found]
 
 
 def _refuse_existing(files: Sequence[Path]) -> None:

@@ -10,7 +10,7 @@ import os
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 import numpy as np
 import torch
@@ -128,27 +128,46 @@ class Journal:
 
     def __init__(self, path: Path, scene: Scene) -> None:
         self.path, self._scene = path, scene
+        self._size = 0
 
     def append(self, entry: dict[str, Any]) -> None:
         """Append a line and wait until it is on the disk, so that a later crash does not lose it.
 
         Raises:
             OSError: If it cannot be written; the file then has no part of it.
+            SceneFolderError: If another program has changed the file since it was read.
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        size = self.path.stat().st_size if self.path.exists() else 0
-        lines = [entry] if size else [self._header(), entry]
-        try:
-            with open(self.path, "a", encoding="utf-8") as file:
+        lines = [entry] if self._size else [self._header(), entry]
+        with open(self.path, "a", encoding="utf-8") as file:
+            _lock(file)
+            before = os.fstat(file.fileno()).st_size
+            try:
+                self.check_unchanged()
                 file.write("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
                 file.flush()
                 os.fsync(file.fileno())
-        except OSError:
-            if size:
-                os.truncate(self.path, size)
-            else:
-                self.path.unlink(missing_ok=True)
-            raise
+                self._size = os.fstat(file.fileno()).st_size
+            except (OSError, SceneFolderError):
+                if before:
+                    os.truncate(self.path, before)
+                else:
+                    self.path.unlink(missing_ok=True)
+                raise
+
+    def check_unchanged(self) -> None:
+        """Refuse to go on after the steps of another program.
+
+        Raises:
+            SceneFolderError: If the file is not as it was read or written here.
+        """
+        if (self.path.stat().st_size if self.path.exists() else 0) != self._size:
+            raise SceneFolderError(
+                self.path,
+                expected="the steps as they were read",
+                found="steps of another program",
+                remedy="run the command again, or start lexsplat view again",
+            )
 
     def read(self) -> tuple[list[Step], list[Step]]:
         """The steps, and those that were undone, the latest undone last.
@@ -182,14 +201,17 @@ class Journal:
 
     def _lines(self) -> list[str]:
         try:
-            lines = self.path.read_text(encoding="utf-8").split("\n")
+            content = self.path.read_bytes()
+            lines = content.decode("utf-8").split("\n")
         except (OSError, UnicodeDecodeError) as error:
             raise FileFormatError(
                 self.path, expected="a readable journal", found=str(error), remedy="discard the edit"
             ) from error
         if lines[-1]:
             logging.getLogger("lexsplat").warning("%s: the last line is cut off and ignored", self.path)
-            self.path.write_text("\n".join([*lines[:-1], ""]), encoding="utf-8")
+            content = "\n".join([*lines[:-1], ""]).encode()
+            self.path.write_bytes(content)
+        self._size = len(content)
         return lines[:-1]
 
     def _header(self) -> dict[str, Any]:
@@ -209,6 +231,15 @@ class Journal:
                 found="edits of another one",
                 remedy="the scene was built again: discard the edits",
             )
+
+
+def _lock(file: IO[str]) -> None:
+    """Wait until no other program writes to a file; the lock ends when it is closed."""
+    try:
+        import fcntl
+    except ImportError:  # Windows has no flock: two writers at the same moment are not detected
+        return
+    fcntl.flock(file, fcntl.LOCK_EX)
 
 
 def journal_of(scene: Scene) -> Path:

@@ -97,6 +97,7 @@ def keep(scene: Scene) -> None:
             _write_objects(
                 scene, KeptObjects(scene.objects, classifier.places), path.with_name("objects.safetensors")
             )
+        scene.write_texts()
     except (OSError, LexsplatError) as error:
         # Nothing is lost: questions compute it, and report a missing encoder.
         log.debug("%s: not kept (%s)", path, str(error)[:200])
@@ -208,7 +209,10 @@ def _scene_parts(scene: Scene) -> Iterator[bytes]:
     yield f"{_SEEN_VERSION} {scene.gaussians.antialiased}".encode()
     gaussians, segments = scene.gaussians, scene.field.segments
     tensors = [gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits]
-    for tensor in [*tensors, *([segments.labels, segments.masses, segments.levels] if segments else [])]:
+    of_segments = [segments.labels, segments.masses, segments.levels] if segments else []
+    if segments and segments.hidden is not None:
+        of_segments.append(segments.hidden)
+    for tensor in [*tensors, *of_segments]:
         yield np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes()
     for name, view in scene.views.items():
         yield f"{name}\0{view.split}\0{view.camera.width}x{view.camera.height}".encode()

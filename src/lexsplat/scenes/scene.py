@@ -150,6 +150,11 @@ class Scene:
             found.update((prompt, self._texts.put(prompt, vector)) for prompt, vector in zip(new, vectors))
         return torch.stack([vector for prompt in prompts if (vector := found[prompt]) is not None])
 
+    def write_texts(self) -> None:
+        """Write what was embedded to the caches on disk, as the end of the process does."""
+        if self._cache is not None:
+            self._cache.write()
+
     def encode_text(self, texts: list[str]) -> Tensor:
         """Embeddings ``[T, D]`` of whole sentences, from the encoder that belongs to the language.
 

@@ -8,7 +8,7 @@ import logging
 import re
 import reprlib
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -90,14 +90,18 @@ class OpenScene:
 
 
 def open_scenes(
-    paths: Sequence[str], device: str = "auto", clip: str | None = None, listener: Listener = silent
+    paths: Sequence[str],
+    device: str = "auto",
+    clip: str | None = None,
+    listener: Listener = silent,
+    taken: Container[str] = (),
 ) -> dict[str, OpenScene]:
-    """Several scenes by the names of their folders; a number is added to a name that occurs twice."""
+    """Several scenes by the names of their folders; a number is added to one that occurs twice or is ``taken``."""
     found: dict[str, OpenScene] = {}
     for path in paths:
         base = name = Path(path).resolve().name if path != "demo" else path
         number = 2
-        while name in found:
+        while name in found or name in taken:
             name, number = f"{base}-{number}", number + 1
         found[name] = OpenScene(path, device, clip, listener)
     return found

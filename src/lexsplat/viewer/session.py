@@ -25,7 +25,7 @@ from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.editing import Editor, Motion
-from lexsplat.scenes.exporting import export_gaussians
+from lexsplat.scenes.exporting import export_scene
 from lexsplat.scenes.journal import journal_of
 from lexsplat.scenes.publishing.manifest import MOST_OBJECTS, checksums, object_entries, scene_manifest
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
@@ -79,7 +79,6 @@ class Session:
         self.version = 1
         self.closed = False
         """Ends `warm_up`."""
-        self._journal_size = self._journal_bytes()
         self.content = self._make_content(self.version)
         self._prepared = self.content
 
@@ -166,7 +165,7 @@ class Session:
         chosen = self._chosen(asked)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"selection{ending}"
-            export_gaussians(chosen.selected, path, world=self.scene.world)
+            export_scene(self.scene, path, found=[chosen])
             return f"{file_name(chosen.phrase)}{ending}", path.read_bytes()
 
     def _select(self, asked: Asked) -> Selection:
@@ -236,13 +235,8 @@ class Session:
         """
         if action not in (*CHANGES, "undo", "redo"):
             raise QueryError("action", expected=", ".join((*CHANGES, "undo", "redo")), found=action[:40])
-        if self._journal_bytes() != self._journal_size:
-            raise SceneFolderError(
-                self._journal_path() or "edits",
-                expected="the steps of this viewer",
-                found="steps of another program",
-                remedy="start lexsplat view again",
-            )
+        if self.editor.journal is not None:
+            self.editor.journal.check_unchanged()
         try:
             if action in ("undo", "redo"):
                 getattr(self.editor, action)()
@@ -256,13 +250,12 @@ class Session:
             ) from error
         except OSError as error:
             raise SceneFolderError(
-                error.filename or self._journal_path() or tempfile.gettempdir(),
+                error.filename
+                or (self.editor.journal.path if self.editor.journal else tempfile.gettempdir()),
                 expected="a file that can be written",
                 found=error.strerror or str(error),
                 remedy="nothing was changed: make room and try again",
             ) from error
-        finally:
-            self._journal_size = self._journal_bytes()
         self.content = self._prepared
         self.version = self.content.manifest["server"]["version"]
         return self.content.manifest
@@ -295,13 +288,6 @@ class Session:
             getattr(self.editor, action)(chosen, motion)
         else:
             getattr(self.editor, action)(chosen)
-
-    def _journal_path(self) -> Path | None:
-        return self.editor.journal.path if self.editor.journal else None
-
-    def _journal_bytes(self) -> int:
-        journal = self._journal_path()
-        return journal.stat().st_size if journal is not None and journal.exists() else 0
 
     # -- content
 

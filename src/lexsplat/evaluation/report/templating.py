@@ -111,7 +111,8 @@ def _latex(text: str) -> str:
 
 
 _PROVENANCE = (
-    "seed", "seeds", "device", "method", "clip", "dino", "downscale", "iterations", "platform", "cpu", "cores", "gpu",
+    "seed", "seeds", "device", "method", "clip", "dino", "downscale", "iterations", "photos", "platform", "cpu",
+    "cores", "gpu",
 )  # fmt: skip
 
 
@@ -123,6 +124,7 @@ def _provenance(config: Mapping[str, Any], machine: Mapping[str, Any]) -> list[t
         prompt_list = ground_truth.get("prompt_list")
         prompts = f"prompts of the list {prompt_list}" if prompt_list else "prompts of the ground truth"
         pairs.append(("ground truth", f"{ground_truth.get('folder')}, {prompts}"))
+    pairs += [("warning", warning) for warning in known.get("warnings", ())]
     if versions := machine.get("versions"):
         pairs.append(("versions", ", ".join(f"{name} {value}" for name, value in versions.items())))
     return pairs

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ from lexsplat.pipeline.viewpoints.floaters import find_floaters
 from lexsplat.pipeline.viewpoints.writing import write_chosen_capture
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.runtime.progress import NOTE, Listener, uncounted
+from lexsplat.runtime.progress import NOTE, Listener, kept_warnings, uncounted, warn_again
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.reading import read_splats
 
@@ -63,12 +61,11 @@ def capture_of_splats(
     if not (complete and folder.is_finished("views", key)):
         start = time.perf_counter()
         folder.reopen("views")
-        with _kept_warnings() as warnings:
+        with kept_warnings() as warnings:
             facts = _choose(splats, poses, config, device, listener)
         folder.finish("views", key, time.perf_counter() - start, **facts, warnings=warnings)
     else:
-        for warning in folder.record["stages"]["views"].get("warnings", ()):
-            log.warning("%s", warning)
+        warn_again(folder.record["stages"]["views"])
     folder.record["images"] = "poses/images"
     folder.record["capture"] = None
     return load_capture(poses, test_every=0)
@@ -104,19 +101,6 @@ def _choose(
         "unseen": chosen.unseen,
         "floaters": len(floaters),
     }
-
-
-@contextlib.contextmanager
-def _kept_warnings() -> Iterator[list[str]]:
-    """The warnings of lexsplat in this block, which are shown as well."""
-    found: list[str] = []
-    handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: found.append(record.getMessage())  # type: ignore[method-assign]
-    log.addHandler(handler)
-    try:
-        yield found
-    finally:
-        log.removeHandler(handler)
 
 
 def splats_of_capture(splats: Path, capture: Capture, folder: SceneFolder) -> Gaussians:

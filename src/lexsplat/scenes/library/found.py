@@ -109,7 +109,7 @@ class Hit:
         with torch.no_grad():
             shown = render(scene.gaussians, camera, features=carried)
         image = Image.fromarray((shown.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
-        if shown.features is not None and bool((seen := shown.features[..., 0] > _COVERED).any()):
+        if things and shown.features is not None and bool((seen := shown.features[..., 0] > _COVERED).any()):
             ys, xs = (each.cpu().numpy() for each in seen.nonzero(as_tuple=True))
             frame = (xs.min() - 2, ys.min() - 2, xs.max() + 2, ys.max() + 2)
             ImageDraw.Draw(image).rectangle([int(side) for side in frame], outline="red", width=2)

@@ -277,17 +277,22 @@ def _best_view(contents: Contents, part: Array) -> tuple[int, tuple[int, int, in
     return best[1], best[2]
 
 
-def with_world(indexed: Indexed, stored: Any) -> tuple[Indexed, World]:
+def with_world(indexed: Indexed, stored: Any) -> tuple[Indexed, World] | None:
     """The answer in meters where the scene's scale has been set since it was added, and its world.
 
     Args:
         indexed: The answer.
         stored: The entry "world" of its ``scene.json``, if it has one.
+
+    Returns:
+        None if the up direction has changed since: the boxes of the answer would not be upright.
     """
-    world = World.from_json(indexed.contents.facts["world"])
+    world = before = World.from_json(indexed.contents.facts["world"])
     if isinstance(stored, Mapping):
         with contextlib.suppress(SceneFolderError):
             world = World.from_json(stored)
+    if not np.allclose(world.up.direction, before.up.direction, atol=1e-6):
+        return None
     if world.meters_per_unit is None:
         return indexed, world
     for each in indexed.answer["instances"]:

@@ -182,9 +182,10 @@ class _Asking:
     def _hit(self, name: str, bound: float, record: Record | None) -> Hit:
         if record is not None and record.contents and not self.confirm:
             folder = SceneFolder.open(self.library.folder(record))
-            found = None if self.library.is_rebuilt(record) else self._indexed(record)
-            if found is not None:
-                found, world = with_world(found, folder.record.get("world"))
+            indexed = None if self.library.is_rebuilt(record) else self._indexed(record)
+            current = indexed and with_world(indexed, folder.record.get("world"))
+            if current:
+                found, world = current
                 path = str(folder.root)
                 return Hit(name, path, bound, found.answer, record.clip, world, self.library, found)
         scene = self.library.scene(name)
