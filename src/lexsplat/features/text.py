@@ -103,8 +103,8 @@ class TextCache:
     """
 
     def __init__(self, *folders: Path, read_only: Path | None = None) -> None:
-        self._written = [_Store(Path(folder)) for folder in folders]
-        self._read = [*self._written, *([] if read_only is None else [_Store(read_only)])]
+        self._written = [_store(Path(folder)) for folder in folders]
+        self._read = [*self._written, *([] if read_only is None else [_store(read_only)])]
 
     def encode(
         self,
@@ -197,6 +197,14 @@ class _Store:
     def write(self) -> None:
         """Write the texts that wait."""
         _write_rest(self._folder, self._known, self._unwritten)
+
+
+_stores: weakref.WeakValueDictionary[Path, _Store] = weakref.WeakValueDictionary()
+"""Those in use: scenes of one process read the texts of each other that wait to be written."""
+
+
+def _store(folder: Path) -> _Store:
+    return _stores.setdefault(folder.absolute(), _Store(folder))
 
 
 def _path(folder: Path, content_hash: str) -> Path:
