@@ -147,7 +147,6 @@ class TextCache:
             store.add(content_hash, {prompt: found[prompt] for prompt in wanted})
         return torch.stack([found[prompt] for prompt in prompts])
 
-
     def write(self) -> None:
         """Write the texts that wait."""
         for store in self._written:
