@@ -3,7 +3,7 @@
 Every phrase has a best place in every scene, even if the object is absent. Presence is decided by how well the phrase
 describes that place, on the scale of everyday words (`lexsplat.queries.everyday`):
 
-- *ratio*: the height of the phrase there, over that of the everyday word that describes the place best. At the teddy
+- *ratio*: the height of the phrase there, over that of the everyday words that describe its codes best. At the teddy
   bear "giraffe" may score high, but "stuffed animal" scores higher;
 - *height*: the height of the phrase there, over those that the scene's best described words reach at their places.
 
@@ -65,7 +65,7 @@ class Evidence:
     """Evidence that the scene holds a phrase (see the module).
 
     Args:
-        ratio: Height at the best place over that of the best everyday word there.
+        ratio: Height at the best place over that of the best everyday words at its codes.
         height: Height at the best place over those of the scene's best described words.
         yes: Strength from which the answer is "yes".
         no: Strength below which it is "no".
