@@ -300,12 +300,14 @@ class _Extraction:
         try:
             for (name, levels, places), unique in encode_stream(self._encode, self._jobs(), self.batch_size):
                 entry = self.entries[name]
-                tokens = unique[places]
-                if tokens.ndim == 2:
-                    write_crops(entry.clip, levels, tokens, entry.image_size)
+                if unique.ndim == 2:
+                    write_crops(entry.clip, levels, unique[places], entry.image_size)
                 else:
-                    patches = patch_map(levels, tokens[:, 1:], *entry.image_size, *entry.map_size)
-                    write_crops(entry.clip, levels, tokens[:, 0], entry.image_size, patches)
+                    whole, tokens = unique[places, 0], unique[:, 1:][places]
+                    del unique  # as large as the tokens
+                    patches = patch_map(levels, tokens, *entry.image_size, *entry.map_size)
+                    del tokens
+                    write_crops(entry.clip, levels, whole, entry.image_size, patches)
                 self._finished.put(name)
         except BaseException:
             self._stop.set()

@@ -299,9 +299,7 @@ def encode_stream(
     def finished() -> Iterator[tuple[Key, Tensor]]:
         while waiting and sum(map(len, ready)) >= waiting[0][1]:
             key, count = waiting.popleft()
-            embeddings = torch.cat(ready)
-            ready[:] = [embeddings[count:]]
-            yield key, embeddings[:count]
+            yield key, _taken(ready, count)  # no name here: it is freed as soon as the caller is done with it
 
     for key, chunks in jobs:
         count = 0
@@ -317,6 +315,18 @@ def encode_stream(
     if sum(map(len, buffer)):
         ready.append(encode(torch.cat(buffer)))
     yield from finished()
+
+
+def _taken(ready: list[Tensor], count: int) -> Tensor:
+    """The first ``count`` rows of some tensors, which lose them."""
+    taken = []
+    while count:
+        first = ready.pop(0)
+        taken.append(first[:count])
+        if len(first) > count:
+            ready.insert(0, first[count:].clone())
+        count -= len(taken[-1])
+    return torch.cat(taken) if taken else ready[0][:0]
 
 
 def batch_size_for(memory: int, image_size: int) -> int:
