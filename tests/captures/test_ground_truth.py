@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from support.written_captures import HEIGHT, WIDTH, save, write_colmap
 from lexsplat.captures import load_annotations, load_capture
 from lexsplat.captures.ground_truth.layouts import layout_of, load_ground_truth, polygon_mask
 from lexsplat.captures.ground_truth.prompt_lists import SCENES, prompt_names
+from lexsplat.evaluation.demo import demo_capture
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 
 NAMES = [f"{number:02d}.jpg" for number in range(6)]
@@ -314,3 +316,12 @@ def test_a_polygon_by_hand():
     expected[1:5, 2:5] = True
     np.testing.assert_array_equal(polygon_mask([[2, 1], [4.9, 1], [4.9, 4.9], [2, 4.9]], 7, 6), expected)
     assert not polygon_mask([], 7, 6).any()
+
+
+def test_the_folder_that_holds_the_ground_truth_may_be_given_for_it(tmp_path):
+    capture = load_capture(demo_capture("second"))
+    shutil.copytree(demo_capture("second") / "segmentations", tmp_path / "segmentations")
+    found, same = (load_annotations(capture, folder) for folder in (tmp_path, tmp_path / "segmentations"))
+    assert found.origin == same.origin == tmp_path / "segmentations"
+    assert found.masks == same.masks
+    assert len(found.masks) == 6

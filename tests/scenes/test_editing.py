@@ -12,9 +12,11 @@ from scipy.spatial.transform import Rotation
 from support.language_scene import make_scene
 
 from lexsplat.language.fields import CodeField
+from lexsplat.language.segments import Segments
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.scenes.editing import Editor, Motion, recolored
+from lexsplat.scenes.exporting import export_scene
 from lexsplat.scenes.folder import SceneFolder, StoredView
 from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.journal import Step
@@ -317,6 +319,17 @@ def test_a_moved_thing_is_found_whole_where_it_is_now(demo, tmp_path, motion):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("phrase", "others"), [("vase", {}), ("stack of books", {"pumpkin": 1})])
+def test_what_closes_a_hole_is_no_thing(demo, phrase, others):
+    """The surface below goes on, not the remains of the thing or the rims of its neighbors."""
+    editor = Editor(demo)
+    editor.delete(demo.find(phrase))
+    found = editor.scene.find(phrase)
+    assert found.present != "yes" or found.count == 0
+    assert {name: editor.scene.find(name).count for name in others} == others
+
+
+@pytest.mark.slow
 def test_things_keep_their_sizes_when_another_one_is_deleted(demo):
     editor = Editor(demo)
     editor.delete(demo.find("banana"))
@@ -324,3 +337,30 @@ def test_things_keep_their_sizes_when_another_one_is_deleted(demo):
         now, before = editor.scene.find(name), demo.find(name)
         assert len(now) == len(before)
         assert np.allclose(now.box.half_sizes, before.box.half_sizes, atol=1e-6)
+
+
+def test_copies_are_segments_of_their_own():
+    segments = Segments(
+        torch.tensor([0, 1, 2, 2]), torch.arange(4.0), torch.tensor([[0, 1, 2], [0, 0, 1], [0, 0, 0]])
+    )
+    both = segments.with_copy(torch.tensor([False, True, True, True]))
+    assert both.labels.tolist() == [0, 1, 2, 2, 3, 4, 4]
+    assert both.levels.tolist() == [[0, 1, 2, 3, 4], [0, 0, 1, 3, 4], [0, 0, 0, 3, 3]]
+    assert both.masses.tolist() == [0, 1, 2, 3, 1, 2, 3]
+
+
+@pytest.mark.slow
+def test_a_thing_that_no_photo_shows_has_no_best_view(demo):
+    editor = Editor(demo)
+    editor.move(demo.find("mug"), Motion((0, 0, 1e9)), fill=False)
+    found = editor.scene.find("mug")
+    assert found.to_dict()["instances"][0]["best_view"] == ""
+
+
+@pytest.mark.slow
+def test_what_is_too_far_for_a_format_is_refused_with_another_one(demo, tmp_path):
+    editor = Editor(demo)
+    editor.move(demo.find("mug"), Motion((0, 0, 1e9)), fill=False)
+    with pytest.raises(SceneFolderError, match=r"write \.ply, or delete what is far away"):
+        export_scene(editor.scene, tmp_path / "far.spz")
+    assert list(tmp_path.iterdir()) == []

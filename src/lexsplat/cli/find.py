@@ -64,7 +64,7 @@ class Find:
 
 
 def _print_answer(answer: dict[str, Any]) -> None:
-    from lexsplat.scenes.serving import shortened
+    from lexsplat.scenes.serving import seen_in, shortened
 
     understood = f" (understood as {shortened(answer['understood'])})"
     note = f"; {answer['note']}" if answer["note"] else ""
@@ -78,5 +78,5 @@ def _print_answer(answer: dict[str, Any]) -> None:
             size, unit = " x ".join(f"{v:.3f}" for v in thing["size_meters"]) + " m", " scene units"
         print(
             f"  {number}. {shortened(thing['name'], 60)} at ({center}){unit}, size {size}, "
-            f"score {thing['score']:.2f}, {thing['gaussians']} Gaussians, best seen in {thing['best_view']}"
+            f"score {thing['score']:.2f}, {thing['gaussians']} Gaussians, {seen_in(thing)}"
         )

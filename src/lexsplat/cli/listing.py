@@ -84,6 +84,8 @@ def _sheet_of(scene: Scene) -> Path:
 
 
 def _print_objects(document: dict[str, Any]) -> None:
+    from lexsplat.scenes.serving import seen_in
+
     for number, thing in enumerate(document["objects"], start=1):
         center = ", ".join(f"{value:.2f}" for value in thing["center"])
         size = " x ".join(f"{value:.2f}" for value in thing["size"])
@@ -92,7 +94,7 @@ def _print_objects(document: dict[str, Any]) -> None:
         names = ", ".join(f"{each['name']} {each['probability']:.2f}" for each in thing["names"])
         print(
             f"{number}. {names}; {' and '.join(thing['colors'])}; at ({center}), size {size}, "
-            f"{thing['gaussians']} Gaussians, best seen in {thing['best_view']}"
+            f"{thing['gaussians']} Gaussians, {seen_in(thing)}"
         )
     print(f"{len(document['objects'])} objects, named with {document['words']} words")
     for line in filter(None, (document["note"], document["picture"])):

@@ -74,6 +74,10 @@ def evaluate_scene(
         if is_of_chosen_views(record):
             way = "views of splats are no ground truth, so give lexsplat language the photos, too"
         log.warning("%s: no held-out views: neither images nor language are measured; %s", folder.root, way)
+    if edits := record.get("edits"):
+        log.warning(
+            "%s: an edited scene is measured beside photos from before its %d edits", folder.root, len(edits)
+        )
     source = GroundTruthSource(masks, prompt_list)
     found = load_annotations(photos) if source == GroundTruthSource() else read_held_out(photos, source)
     gallery = Gallery()

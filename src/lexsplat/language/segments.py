@@ -93,6 +93,17 @@ class Segments:
         hidden = None if self.hidden is None else self.hidden[index]
         return Segments(self.labels[index], self.masses[index], self.levels, hidden)
 
+    def with_copy(self, mask: Tensor) -> Segments:
+        """The segments with a copy of some Gaussians ``[N]`` bool at the end, whose segments are its own."""
+        index = torch.cat([torch.arange(len(self.labels), device=mask.device), mask.nonzero()[:, 0]])
+        both, first = self.select(index), self.levels.shape[1]
+        sources, copies = self.labels[mask].unique(return_inverse=True)
+        levels = [
+            torch.cat([level, first + level[sources].unique(return_inverse=True)[1]]) for level in self.levels
+        ]
+        labels = torch.cat([self.labels, first + copies])
+        return Segments(labels, both.masses, torch.stack(levels), both.hidden)
+
     def tensors(self) -> dict[str, Tensor]:
         """For safetensors: 4 bytes a Gaussian if there are at most 65,536 segments."""
         small = self.levels.shape[1] <= 1 << 16

@@ -304,7 +304,7 @@ class Selection:
             "count": len(instances),
             "gaussians": self.num_gaussians,
             "threshold": round(float(self.threshold), 4),
-            "best_view": self.best_view if instances else "",
+            "best_view": self._shown_in if instances else "",
             "instances": [instance.geometry() for instance in instances],
         }
 
@@ -324,10 +324,15 @@ class Selection:
             "size": [round(float(v), 5) for v in 2 * box.half_sizes],
             **known,
             "axes": [[round(float(v), 5) for v in axis] for axis in box.axes],
-            "best_view": self.best_view,
+            "best_view": self._shown_in,
         }
 
     # -- inside
+
+    @property
+    def _shown_in(self) -> str:
+        """`best_view`, or "" if not even that shows it."""
+        return self.best_view if self.view_shares and self.view_shares[0][1] > 0 else ""
 
     @cached_property
     def sample(self) -> NDArray[np.float64]:

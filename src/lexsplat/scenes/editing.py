@@ -22,6 +22,7 @@ from torch import Tensor
 
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.language.fields import LanguageField
+from lexsplat.language.segments import Segments
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.visibility import whole_things, with_remains
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
@@ -55,7 +56,8 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
     if step.kind == "duplicate":
         everything = torch.arange(len(gaussians), device=gaussians.device)
         index = torch.cat([everything, everything[mask]])
-        gaussians, language = gaussians.select(index), language.select(index)
+        segments = language.segments and language.segments.with_copy(mask.to(language.segments.labels.device))
+        gaussians, language = gaussians.select(index), _with_segments(language.select(index), segments)
         mask = torch.arange(len(index), device=mask.device) >= len(everything)
     changed = gaussians.select(mask)
     if step.kind == "recolor":
@@ -164,9 +166,13 @@ def _with_hidden(scene: Scene) -> LanguageField:
     segments = scene.field.segments
     if segments is None or segments.hidden is not None:
         return scene.field
-    field = copy.copy(scene.field)
-    field.segments = replace(segments, hidden=scene.hidden.to(segments.labels.device))
-    return field
+    return _with_segments(scene.field, replace(segments, hidden=scene.hidden.to(segments.labels.device)))
+
+
+def _with_segments(language: LanguageField, segments: Segments | None) -> LanguageField:
+    changed = copy.copy(language)
+    changed.segments = segments
+    return changed
 
 
 class Editor:
@@ -313,7 +319,9 @@ class Editor:
         if fill:
             cameras = [view.camera for view in self.original.views.values() if view.split == "train"]
             things = replace(chosen, mask=gone, parts=())
-            found, gone = fill_for(things, cameras, self.original.listener, self.scene.hidden)
+            found, gone = fill_for(
+                things, cameras, self.original.listener, self.scene.hidden, self.scene.field.segments
+            )
             if found is not None:
                 values["fill"] = found.to_json()
         if kind == "move":

@@ -76,7 +76,7 @@ def export_gaussians(
         The files that were written.
 
     Raises:
-        SceneFolderError: If the ending is unknown, the format cannot hold language, or a file exists.
+        SceneFolderError: If the ending is unknown, the format cannot hold language or a number, or a file exists.
         QueryError: If there are no Gaussians.
         BackendError: If the format needs a library that is not installed.
     """
@@ -107,7 +107,12 @@ def export_gaussians(
         with atomic_path(written[-1]) as temporary:
             write_codebook(language, temporary)
     with atomic_path(path) as temporary:
-        writers[ending](temporary)
+        try:
+            writers[ending](temporary)
+        except ValueError as error:  # numbers that the format cannot hold
+            remedy = "write .ply, or delete what is far away"
+            expected = f"Gaussians that {ending} can hold"
+            raise SceneFolderError(path, expected=expected, found=str(error), remedy=remedy) from error
     return written
 
 

@@ -28,6 +28,7 @@ from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
+from lexsplat.language.segments import Segments
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.visibility import inside_hull
 from lexsplat.runtime.progress import Event, Listener, silent
@@ -62,6 +63,8 @@ _UNSEEN = 0.3
 _SIZES = (0.8, 0.8, 0.1)
 """Standard deviations of a disk along its axes, in pixels."""
 _OPAQUE = 3.0
+_FLAT, _LARGE = 0.5, 0.25
+"""A segment of which less is flat rises from the surface, unless it is this share of the scene, as a group is."""
 _COLUMNS = 13
 _MOST = 1 << 20
 
@@ -133,6 +136,7 @@ def fill_for(
     cameras: Sequence[Camera] = (),
     listener: Listener = silent,
     hidden: Tensor | None = None,
+    segments: Segments | None = None,
 ) -> tuple[Fill | None, Tensor]:
     """The Gaussians that close the surfaces under a deleted selection, and those that are deleted with it.
 
@@ -141,6 +145,7 @@ def fill_for(
         cameras: The views that the scene was made from.
         listener: Receives events of stage "fill", one unit a thing.
         hidden: Which Gaussians are hidden ``[N]`` bool; others that stand on a thing stay. None takes all as hidden.
+        segments: The segments of the scene: the fill takes no language from things that stand on the surface.
 
     Returns:
         The fill, None if there is nothing to fill, and the selection with the remains under its things ``[N]`` bool.
@@ -151,7 +156,7 @@ def fill_for(
     try:
         for done, thing in enumerate(things):
             listener(Event("fill", done, len(things)))
-            fill = _fill_below(thing, gone, shown, cameras)
+            fill = _fill_below(thing, gone, shown, cameras, segments)
             found += [] if fill is None else [fill]
     finally:  # a viewer goes on after an error, and its bar ends
         listener(Event("fill", len(things), len(things)))
@@ -161,7 +166,9 @@ def fill_for(
     return Fill(*(np.concatenate(rows)[:_MOST] for rows in zip(*found))), mask
 
 
-def _fill_below(thing: Selection, gone: Mask, shown: Mask, cameras: Sequence[Camera]) -> Fill | None:
+def _fill_below(
+    thing: Selection, gone: Mask, shown: Mask, cameras: Sequence[Camera], segments: Segments | None
+) -> Fill | None:
     """The Gaussians that close the surface under one thing; remains there are added to ``gone [N]``.
 
     Those that are shown and stand on the thing are no remains: things on a cloth, on a table.
@@ -189,7 +196,9 @@ def _fill_below(thing: Selection, gone: Mask, shown: Mask, cameras: Sequence[Cam
     if not hole.any() or known.sum() < FEWEST:
         return None
     painted = completed(photo.colors, hole, known * (_UNSEEN + photo.shown))
-    members = np.flatnonzero(flat & ~inside)
+    members = np.flatnonzero(flat & ~inside & _of_surface(flat, segments))
+    if not len(members):
+        members = np.flatnonzero(flat & ~inside)
     gone |= inside
     raised = _continued(heights, hole, known)
     places = np.concatenate([photo.cells[hole], raised[:, None]], 1)
@@ -198,6 +207,19 @@ def _fill_below(thing: Selection, gone: Mask, shown: Mask, cameras: Sequence[Cam
     same = np.tile([w, x, y, z, *np.log(photo.size * np.array(_SIZES))], (len(painted), 1))
     disks = np.concatenate([surface.origin + places @ surface.axes, same, painted], 1).astype("<f4")
     return Fill(members[nearest].astype("<i4"), disks)
+
+
+def _of_surface(flat: Mask, segments: Segments | None) -> Mask:
+    """Which Gaussians ``[N]`` belong to no segment that rises from the surface, such as the rim of a pumpkin."""
+    found = np.ones(len(flat), bool)
+    if segments is not None:
+        labels = segments.labels.cpu().numpy()
+        for level in segments.levels.cpu().numpy():
+            members = level[labels]
+            sizes = np.bincount(members)
+            rises = np.bincount(members, flat) < _FLAT * sizes
+            found &= ~(rises & (sizes < _LARGE * len(flat)))[members]
+    return found
 
 
 def _standing(local: FloatArray, thing: Mask, among: Mask) -> Mask:

@@ -138,7 +138,12 @@ def placed(thing: Mapping[str, Any], meters_per_unit: float | None, link: str = 
     """A thing (`Selection.geometry`) with its place and best view, for a sentence."""
     scale, unit = (meters_per_unit, "m") if meters_per_unit else (1.0, "scene units")
     center = ", ".join(f"{value * scale:.2f}" for value in thing["center"])
-    return f"{shortened(thing['name'], 60)}{link}({center}) {unit}, best seen in {thing['best_view']}"
+    return f"{shortened(thing['name'], 60)}{link}({center}) {unit}, {seen_in(thing)}"
+
+
+def seen_in(thing: Mapping[str, Any]) -> str:
+    """Where a thing is seen best, for a sentence."""
+    return f"best seen in {thing['best_view']}" if thing["best_view"] else "in no photo"
 
 
 def shortened(text: str, length: int = 200) -> str:

@@ -193,7 +193,7 @@ def _with_prompts_of(ground_truth: Annotations, root: Path, prompt_list: PromptL
 
 
 def _read_ground_truth(capture: Capture, folder: Path | None) -> Annotations:
-    folder = folder or find_annotations(capture.root)
+    folder = find_annotations(folder or capture.root) or folder
     if folder is None:
         return Annotations("segmentations", capture.root / "segmentations", {})
     layout = layout_of(folder)
