@@ -224,6 +224,22 @@ def test_segments_of_another_size_are_reported_before_structure_from_motion_and_
     )
 
 
+def test_features_of_another_depth_are_reported_before_the_reconstruction(
+    tiny_capture, segments, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("lexsplat.pipeline.geometry.reconstruct", lambda *_, **__: pytest.fail("too late"))
+    told = ["view_03", "features of depth 128", "17"]
+    pairs, arrays = shutil.copytree(segments, tmp_path / "segments"), tmp_path / "arrays"
+    np.save(pairs / "view_03_f.npy", np.ones((4, 17), np.float32))
+    arrays.mkdir()
+    for name in load_capture(tiny_capture).views:
+        depth = 17 if name.startswith("view_03") else 128
+        np.save(arrays / f"{Path(name).stem}.npy", np.ones((72, 96, depth), np.float32))
+    for folder in (pairs, arrays):
+        config = BuildConfig(clip="bundled", dino="none", device="cpu", iterations=2, features_from=folder)
+        build_refused((tiny_capture,), tmp_path / "scene", config, *told, kind=FileFormatError)
+
+
 @pytest.mark.parametrize(
     ("numbers", "told"),
     [

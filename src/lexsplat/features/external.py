@@ -67,9 +67,7 @@ def load_external_features(
         path, reading = sources[name], _Reading(capture.views[name], memory)
         found = reading.segments(path) if path.name.endswith("_f.npy") else reading.arrays(path)
         dims = {"clip": found.clip.shape[-1]} | ({} if found.dino is None else {"dino": found.dino.shape[-1]})
-        if dimension is not None and dims["clip"] != dimension:
-            expected = f"features of depth {dimension}, like the embeddings of the text encoder"
-            raise wrong(path, expected, dims["clip"], "give the encoder of the features with --clip")
+        _check_depth(dims["clip"], dimension, path)
         if depth and dims != depth:
             raise wrong(path, f"features of depth {depth}", dims, "give features of one encoder")
         depth.update(dims)
@@ -82,12 +80,13 @@ def load_external_features(
     return FeatureMaps(list(sources), load, memory // 4)
 
 
-def check_external_features(folder: Path, capture: Capture) -> None:
+def check_external_features(folder: Path, capture: Capture, dimension: int | None = None) -> None:
     """Refuse arrays whose .npy headers are wrong, before anything that takes time; values are checked on access.
 
     Args:
         folder: Folder of the arrays (`load_external_features`).
         capture: Every view must have an array; those of training views are opened. Its cameras are not read.
+        dimension: See `load_external_features`.
 
     Raises:
         FileFormatError: If a view has no array, or one has a wrong shape or type.
@@ -97,8 +96,17 @@ def check_external_features(folder: Path, capture: Capture) -> None:
         reading, path = _Reading(capture.views[name], budget.DEFAULT_MEMORY), sources[name]
         if path.name.endswith("_f.npy"):
             reading.open_segments(path)
+            _check_depth(open_npy(path).shape[-1], dimension, path)
         elif path.suffix == ".npy":
-            reading.check_aspect(open_npy(path).shape, path)
+            shape = open_npy(path).shape
+            reading.check_aspect(shape, path)
+            _check_depth(shape[-1], dimension, path)
+
+
+def _check_depth(found: int, dimension: int | None, path: Path) -> None:
+    if dimension is not None and found != dimension:
+        expected = f"features of depth {dimension}, like the embeddings of the text encoder"
+        raise wrong(path, expected, found, "give the encoder of the features with --clip")
 
 
 def external_sources(folder: Path, capture: Capture) -> dict[str, Path]:

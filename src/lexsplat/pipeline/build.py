@@ -202,6 +202,8 @@ class _Builder:
             sizes = [view.capture_size for view in self._training_views.values()]
             source = self.capture.root
             self.encoders = check_encoders(self.config, source, len(sizes), max(sizes), self.listener)
+        if self.encoders is not None and self.config.features_from is not None:
+            check_given_maps(self.config, self.capture, self.encoders.clip.dim)
         for name in wanted:
             self._run_stage(name, stages[name])
         if until == "language":
