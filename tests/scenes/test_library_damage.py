@@ -13,6 +13,7 @@ from support.library_scenes import OTHERS, contents, hits, write_scene
 
 from lexsplat.runtime.errors import FileFormatError, LibraryError
 from lexsplat.runtime.files import read_json, read_tensors, write_json, write_tensors
+from lexsplat.runtime.progress import NOTE
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.library.entries import Codes, map_codes
 from lexsplat.scenes.library.records import read_record, write_record
@@ -36,7 +37,7 @@ def damage(path: Path) -> None:
     ],
     ids=["one bit", "empty", "truncated", "missing"],
 )
-def test_damaged_codes_are_refused_and_repaired_from_the_scene(rooms_copy, harm):
+def test_damaged_codes_are_refused_and_repaired_from_the_scene(rooms_copy, harm, caplog):
     before = contents(rooms_copy / "library" / "scenes")
     (file,) = (rooms_copy / "library" / "scenes").glob("kitchen.*.safetensors")
     harm(file)
@@ -45,7 +46,9 @@ def test_damaged_codes_are_refused_and_repaired_from_the_scene(rooms_copy, harm)
     assert [hit.scene for hit in found.hits] == ["lab"]
     assert "--repair" in found.skipped["kitchen"]
     assert library.verify().keys() == {"kitchen"}
-    assert library.verify(repair=True) == {}
+    with caplog.at_level(NOTE):
+        assert library.verify(repair=True) == {}
+    assert caplog.messages == ["kitchen: repaired"]
     assert contents(library.stage).keys() == before.keys()
     assert sorted(hits(library, "mug")) == ["kitchen", "lab"]
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from typing import TYPE_CHECKING
 
 from lexsplat.runtime.errors import LexsplatError, LibraryError
-from lexsplat.runtime.progress import Event
+from lexsplat.runtime.progress import NOTE, Event
 from lexsplat.scenes.library.contents import map_contents
 from lexsplat.scenes.library.records import (
     Record,
@@ -20,6 +21,8 @@ from lexsplat.scenes.library.records import (
 
 if TYPE_CHECKING:
     from lexsplat.scenes.library.library import Library
+
+log = logging.getLogger("lexsplat")
 
 
 def problems_of(library: Library) -> dict[str, str]:
@@ -46,10 +49,14 @@ def mended(library: Library) -> dict[str, str]:
         LibraryError: If another process changes the library, the disk is full, or the server fails.
     """
     with library.changing():
-        for name in {**orphans(library), **_entries(library)}:
+        damaged = {**orphans(library), **_entries(library)}
+        for name in damaged:
             _repair(library, name)
         library.bring_to_server()
-    return {**orphans(library), **_entries(library)}
+    left = {**orphans(library), **_entries(library)}
+    for name in damaged.keys() - left:
+        log.log(NOTE, "%s: repaired", name)
+    return left
 
 
 def orphans(library: Library) -> dict[str, str]:
