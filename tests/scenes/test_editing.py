@@ -299,7 +299,7 @@ def test_two_editors_of_one_journal_do_not_overwrite_each_other(base, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def demo():
+def demo() -> Scene:
     return open_scene("demo", device="cpu")
 
 

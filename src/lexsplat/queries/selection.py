@@ -357,15 +357,9 @@ class Selection:
         present = present if word == "or" or bool(mask.any()) else PRESENCES.index("no")
         phrase = f"{self.phrase} {word} {other.phrase}".strip()
         threshold = min(self.threshold, other.threshold) if word == "or" else self.threshold
-        return replace(
-            self,
-            mask=mask,
-            scores=scores,
-            present=PRESENCES[present],
-            phrase=phrase,
-            threshold=threshold,
-            parts=() if word == "or" else self.parts,
-        )
+        parts = () if word == "or" else self.parts
+        facts = {"present": PRESENCES[present], "phrase": phrase, "threshold": threshold, "parts": parts}
+        return replace(self, mask=mask, scores=scores, **facts)  # type: ignore[arg-type]
 
     def described(self, box: Box | None = None, **facts: Any) -> Selection:
         """The same Gaussians with other facts, such as ``phrase`` or ``scores``; a known box stays known."""
@@ -390,10 +384,10 @@ class Selection:
 
     def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centers ``[M, 3]`` and opacities ``[M]`` of the selected Gaussians."""
-        opacities = self.gaussians.opacity_logits.detach()[self.indices].sigmoid()
-        return self.gaussians.means.detach()[
-            self.indices
-        ].cpu().double().numpy(), opacities.cpu().double().numpy()
+        means, logits = (
+            each.detach()[self.indices] for each in (self.gaussians.means, self.gaussians.opacity_logits)
+        )
+        return means.cpu().double().numpy(), logits.sigmoid().cpu().double().numpy()
 
     def _reach(self, distance: float | None) -> float:
         if distance is not None:
