@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from lexsplat.captures import Capture
 from lexsplat.captures.ground_truth.layouts import load_annotations
 from lexsplat.captures.ground_truth.prompt_lists import PromptList
 from lexsplat.evaluation.ground_truth import GroundTruthSource, read_held_out
@@ -24,6 +25,7 @@ from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.facts import is_of_chosen_views
 from lexsplat.scenes.feature_maps import code_colors, feature_picture
+from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.previous import require_current
 from lexsplat.scenes.scene import Scene
 
@@ -69,15 +71,7 @@ def evaluate_scene(
     folder.refuse_bundled()
     require_writable(folder.root)
     photos = reload_capture(folder, capture)
-    if not photos.test_names:
-        way = "build it with --test-every or --test-views"
-        if is_of_chosen_views(record):
-            way = "views of splats are no ground truth, so give lexsplat language the photos, too"
-        log.warning("%s: no held-out views: neither images nor language are measured; %s", folder.root, way)
-    if edits := record.get("edits"):
-        log.warning(
-            "%s: an edited scene is measured beside photos from before its %d edits", folder.root, len(edits)
-        )
+    _warn_of_limits(folder, photos)
     source = GroundTruthSource(masks, prompt_list)
     found = load_annotations(photos) if source == GroundTruthSource() else read_held_out(photos, source)
     gallery = Gallery()
@@ -110,6 +104,19 @@ def evaluate_scene(
     _write_results(folder.root, metrics, gallery, title)
     listener(Event("report", len(gallery.views), len(gallery.views)))
     return metrics.to_json()
+
+
+def _warn_of_limits(folder: SceneFolder, photos: Capture) -> None:
+    """Warn if there is nothing to measure with, or if the scene is no longer that of the photos."""
+    if not photos.test_names:
+        way = "build it with --test-every or --test-views"
+        if is_of_chosen_views(folder.record):
+            way = "views of splats are no ground truth, so give lexsplat language the photos, too"
+        log.warning("%s: no held-out views: neither images nor language are measured; %s", folder.root, way)
+    if edits := folder.record.get("edits"):
+        log.warning(
+            "%s: an edited scene is measured beside photos from before its %d edits", folder.root, len(edits)
+        )
 
 
 def _write_results(root: Path, metrics: Metrics, gallery: Gallery, title: str) -> None:

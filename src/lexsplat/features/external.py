@@ -95,8 +95,8 @@ def check_external_features(folder: Path, capture: Capture, dimension: int | Non
     for name in capture.train_names:
         reading, path = _Reading(capture.views[name], budget.DEFAULT_MEMORY), sources[name]
         if path.name.endswith("_f.npy"):
-            reading.open_segments(path)
-            _check_depth(open_npy(path).shape[-1], dimension, path)
+            of_segments, _ = reading.open_segments(path)
+            _check_depth(of_segments.shape[1], dimension, path)
         elif path.suffix == ".npy":
             shape = open_npy(path).shape
             reading.check_aspect(shape, path)

@@ -94,7 +94,7 @@ class Segments:
         return Segments(self.labels[index], self.masses[index], self.levels, hidden)
 
     def with_copy(self, mask: Tensor) -> Segments:
-        """The segments with a copy of some Gaussians ``[N]`` bool at the end, whose segments are its own."""
+        """The segments after a copy of some Gaussians ``[N]`` bool is appended, which gets segments of its own."""
         index = torch.cat([torch.arange(len(self.labels), device=mask.device), mask.nonzero()[:, 0]])
         both, first = self.select(index), self.levels.shape[1]
         sources, copies = self.labels[mask].unique(return_inverse=True)

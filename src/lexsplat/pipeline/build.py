@@ -15,7 +15,7 @@ from typing import Any
 
 from lexsplat.captures import Capture, View, load_annotations
 from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook, tell_codebook
-from lexsplat.features import FeatureMaps
+from lexsplat.features import FeatureMaps, check_external_features
 from lexsplat.language.code_maps import MaskedCodeMaps, mark_masked_cells
 from lexsplat.language.methods import FitRun, TrainingViews
 from lexsplat.pipeline.config import BuildConfig
@@ -203,7 +203,7 @@ class _Builder:
             source = self.capture.root
             self.encoders = check_encoders(self.config, source, len(sizes), max(sizes), self.listener)
         if self.encoders is not None and self.config.features_from is not None:
-            check_given_maps(self.config, self.capture, self.encoders.clip.dim)
+            check_external_features(self.config.features_from, self.capture, self.encoders.clip.dim)
         for name in wanted:
             self._run_stage(name, stages[name])
         if until == "language":

@@ -178,14 +178,14 @@ def survey_photos(
     return PhotoSurvey(len(capture.train_names), largest)
 
 
-def check_given_maps(config: BuildConfig, capture: Capture, dimension: int | None = None) -> None:
-    """Refuse features of another program and 2D segments that do not fit the photos, or the depth of the encoder.
+def check_given_maps(config: BuildConfig, capture: Capture) -> None:
+    """Refuse features of another program and 2D segments that do not fit the photos.
 
     Raises:
         LexsplatError: As `check_external_features` and `check_segments`.
     """
     if config.features_from is not None:
-        check_external_features(config.features_from, capture, dimension)
+        check_external_features(config.features_from, capture)
     check_segments(config.features, capture)
 
 
