@@ -273,3 +273,26 @@ def test_checkers_go_on_where_a_box_stood_and_nothing_of_its_color_stays(shadow)
     assert psnr[False] < 15, psnr
     red = pictures[True][..., 0] - pictures[True][..., 1:].max(-1)
     assert (red[seen] < 0.2).all(), "neither the box nor the remains under it"
+
+
+def test_specks_that_only_a_deleted_thing_hid_go_with_it_and_others_stay():
+    places = {
+        "behind it": (0.0, 0.3, 0.3),
+        "behind it, farther away": (0.0, 0.45, 0.2),
+        "beside it, in sight": (0.3, -0.2, 0.1),
+    }
+    table, _ = checkered_table_with_a_box()
+    own = table.field.codes[:, 0] == 1
+    means, colors = table.gaussians.means, table.gaussians.sh0[:, 0] * 0.28209479177387814 + 0.5
+    specks = torch.tensor(list(places.values()), dtype=torch.float32)
+    points = torch.cat([means[~own], specks, means[own]]).double().numpy()
+    green = torch.tensor([[0.1, 0.8, 0.1]]).expand(len(specks), 3)
+    scene = solid(points, torch.cat([colors[~own], green, colors[own]]).double().numpy(), int(own.sum()))
+    editor = Editor(scene)
+    editor.delete(box_of(scene))
+    left = {
+        name
+        for name, place in places.items()
+        if bool(torch.isclose(editor.scene.gaussians.means, torch.tensor(place), atol=1e-6).all(1).any())
+    }
+    assert left == {"behind it, farther away", "beside it, in sight"}

@@ -145,11 +145,13 @@ def inside_hulls(chosen: Selection, among: Tensor) -> Tensor:
     return torch.from_numpy(found).to(among.device)
 
 
-def inside_hull(points: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.bool_]:
+def inside_hull(
+    points: NDArray[np.float64], places: NDArray[np.float64], grown: float = _GROWN
+) -> NDArray[np.bool_]:
     """Which places ``[M, 3]`` lie in the convex hull of points ``[K, 3]``, enlarged about its center ``[M]``."""
     try:
         corners = points[ConvexHull(points).vertices] if len(points) > 3 else points
         center = corners.mean(0)
-        return np.asarray(Delaunay(center + _GROWN * (corners - center)).find_simplex(places) >= 0)
+        return np.asarray(Delaunay(center + grown * (corners - center)).find_simplex(places) >= 0)
     except (QhullError, ValueError, IndexError):  # flat or too few
         return np.zeros(len(places), bool)

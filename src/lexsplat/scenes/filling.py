@@ -2,7 +2,8 @@
 
 1. A thing stands on a surface (`lexsplat.scenes.surfaces`). The hole is the part of the surface that hardly any view
    sees, because the thing hides it.
-2. Gaussians of the reconstruction in the hole are deleted, because no photo shows them.
+2. Gaussians of the reconstruction in the hole are deleted, because no photo shows them. So are those near the thing
+   that show mostly without it: few pixels of the photos told their colors.
 3. The pattern of the surface is continued in the hole (`lexsplat.scenes.completing`), in an image from above. Each
    painted pixel becomes a flat Gaussian. It takes the language of its nearest neighbor in the surface.
 
@@ -41,6 +42,7 @@ from lexsplat.scenes.surfaces import (
     from_above,
     looked_up,
     photographed,
+    seen_weights,
     surface_below,
 )
 
@@ -52,6 +54,9 @@ _HIDDEN = 0.88
 """Share of the views in which the thing hides a place, above which the Gaussians there are deleted."""
 _STUFFED = 0.5
 """Share of the views in which the thing hides a Gaussian within its hull, above which that is deleted too."""
+_REVEALED, _AROUND = 3.0, 1.3
+"""Growth of a Gaussian's visible weight without the thing, above which it is deleted if it lies in the thing's hull,
+enlarged by the other factor. Both are chosen on the second scene."""
 _BORDER, _OVERLAP, _RIM = 3, 4, 3
 """Pixels around such places in which Gaussians are deleted, the fill overlaps the rest, and colors do not count."""
 _NEAR = 8
@@ -187,8 +192,10 @@ def _fill_below(
     inside &= ~_standing(local, own & solid, inside & shown)
     stuffing = _stuffing(gaussians, own, gone | inside, cameras)
     inside |= stuffing & ~_standing(local, own & solid, stuffing & shown)
+    revealed = _revealed(gaussians, own, gone, cameras) & (local[:, 2] >= -THICK * surface.radius)
+    inside |= revealed
     _, coverage, heights = from_above(gaussians, surface, flat & ~inside, photo.cells)
-    near = below(local[own & (local[:, 2] <= 2 * surface.radius), :2], photo.cells)
+    near = below(local[(own | revealed) & (local[:, 2] <= 2 * surface.radius), :2], photo.cells)
     filled = binary_dilation(unseen, iterations=_OVERLAP)
     hole = filled | ((near | binary_dilation(filled, iterations=_OVERLAP)) & (coverage < _BARE))
     level = np.abs(heights) <= THICK * surface.radius
@@ -242,6 +249,19 @@ def _stuffing(gaussians: Gaussians, own: Mask, gone: Mask, cameras: Sequence[Cam
     if len(places) and cameras:
         _, covered, _ = looked_up(gaussians, gone, means[places], cameras, 0.0)
         found[places] = covered > _STUFFED
+    return found
+
+
+def _revealed(gaussians: Gaussians, own: Mask, gone: Mask, cameras: Sequence[Camera]) -> Mask:
+    """The Gaussians ``[N]`` around a thing of which the views show several times as much once the thing is gone."""
+    means = gaussians.means.detach().cpu().double().numpy()
+    places = np.flatnonzero(~gone)
+    places = places[inside_hull(means[own], means[places], _AROUND)]
+    found = np.zeros(len(gone), bool)
+    if len(places):
+        weights = [seen_weights(gaussians, kept, cameras) for kept in (np.ones_like(gone), ~gone)]
+        before, after = (each[places] for each in weights)
+        found[places] = after > _REVEALED * before
     return found
 
 

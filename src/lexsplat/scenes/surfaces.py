@@ -19,7 +19,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.rendering import render
+from lexsplat.rendering import accumulate_weights, render
 from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.completing import mean_around
 
@@ -181,7 +181,7 @@ def looked_up(
     colors = np.zeros((len(places), 3))
     thing = torch.from_numpy(gone)[:, None].to(gaussians.means)
     for camera in evenly(cameras, _VIEWS):
-        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / _LONG_SIDE))
+        small = _small(camera)
         with torch.no_grad():
             view = render(gaussians, small, features=thing, depth=True)
         nearest = cast(torch.Tensor, view.depth).cpu().numpy()
@@ -198,6 +198,18 @@ def looked_up(
         colors[here] += (there & ~before)[:, None] * view.image.cpu().double().numpy()[pixels]
     colors /= np.maximum(shown, 1)[:, None]
     return shown / np.maximum(counts, 1), covered / np.maximum(counts, 1), colors
+
+
+def seen_weights(gaussians: Gaussians, kept: Mask, cameras: Sequence[Camera]) -> FloatArray:
+    """Visible weights of some Gaussians, drawn without the others, in some of the views, in their pixels ``[N]``."""
+    drawn, weights = gaussians.select(torch.from_numpy(kept).to(gaussians.device)), np.zeros(len(kept))
+    for camera in evenly(cameras, _VIEWS):
+        weights[kept] += accumulate_weights(drawn, _small(camera)).cpu().double().numpy()
+    return weights
+
+
+def _small(camera: Camera) -> Camera:
+    return camera.downscaled(max(1.0, max(camera.width, camera.height) / _LONG_SIDE))
 
 
 def from_above(
