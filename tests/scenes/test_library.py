@@ -19,6 +19,7 @@ from lexsplat.runtime.errors import LibraryError, QueryError, SceneFolderError
 from lexsplat.runtime.files import read_json, write_json
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.scenes.answers import find_phrase
+from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.library.bounds import SURELY_NOT, phrase_bound, presence_bounds
@@ -132,6 +133,24 @@ def test_the_order_and_the_bits_of_an_answer_do_not_depend_on_the_number_of_thre
     finally:
         torch.set_num_threads(before)
     assert np.array_equal(*found)
+
+
+@pytest.mark.parametrize("limit", [0, 1.5, "3", None])
+def test_a_limit_that_is_no_number_of_scenes_is_refused(rooms, limit):
+    with pytest.raises(QueryError, match="limit: expected a whole number of at least 1"):
+        lexsplat.open_library(rooms / "library").search("mug", limit=limit)
+
+
+def test_a_search_is_for_one_phrase(rooms):
+    library = lexsplat.open_library(rooms / "library")
+    assert library.search(["mug"]) == library.search("mug")
+    with pytest.raises(QueryError, match="expected one phrase, found 2"):
+        library.search(["mug", "violin"])
+
+
+def test_a_device_that_is_none_is_refused_at_once(rooms):
+    with pytest.raises(ValueError, match="device"):
+        lexsplat.open_library(rooms / "library", device="gpu")
 
 
 def test_a_limit_leaves_the_best_scenes_and_reports_of_the_others(rooms):
@@ -276,6 +295,37 @@ def test_a_rebuilt_scene_is_reported_and_its_old_codes_are_dropped(rooms_copy):
     assert library.search("candle").rebuilt == {}
     assert sorted(hits(library, "candle")) == ["kitchen", "lab", "office"]
     assert len(list(library.stage.glob("kitchen.*.safetensors"))) == 1
+
+
+def moved_edit(source, output, by):
+    """A copy of a scene whose mug is moved; all of them have as many Gaussians."""
+    editor = Editor(open_scene(source))
+    editor.move(editor.scene.find("mug"), Motion(translation=by), fill=False)
+    editor.save(output)
+
+
+def test_another_edit_of_the_same_scene_is_not_taken_for_the_one_that_was_added(rooms_copy):
+    library, place = Library(rooms_copy / "library"), rooms_copy / "edited"
+    moved_edit(rooms_copy / "kitchen", place, (5.0, 0.0, 0.0))
+    library.add(place)
+    shutil.rmtree(place)
+    moved_edit(rooms_copy / "kitchen", place, (0.0, 5.0, 0.0))
+    assert "rebuilt since it was added" in library.verify()["edited"]
+    expected = find_phrase(open_scene(place), "mug")
+    found = {hit.scene: hit.answer for hit in library.search("mug").hits}
+    assert found["edited"] == expected, "the scene itself is asked"
+    moved_edit(rooms_copy / "kitchen", rooms_copy / "third", (0.0, 0.0, 5.0))
+    place.rename(rooms_copy / "elsewhere")
+    assert library.add(rooms_copy / "third").name == "third", "not the name of the lost one"
+
+
+def test_edits_of_an_edited_scene_are_listed_after_its_own(rooms_copy):
+    for source, output in (("kitchen", "once"), ("once", "twice")):
+        moved_edit(rooms_copy / source, rooms_copy / output, (1.0, 0.0, 0.0))
+    once, twice = (SceneFolder.open(rooms_copy / name).record for name in ("once", "twice"))
+    assert len(once["edits"]) == 1
+    assert twice["edits"] == once["edits"] * 2
+    assert twice["edits_fingerprint"] != once["edits_fingerprint"]
 
 
 def test_a_scene_that_was_only_copied_is_not_rebuilt(rooms_copy):

@@ -230,6 +230,30 @@ def test_a_damaged_copy_of_a_record_is_written_again(rooms_copy):
     assert library.verify(repair=True) == {}
 
 
+def test_verify_finds_a_scene_that_cannot_be_opened(rooms_copy):
+    (rooms_copy / "kitchen" / "language.safetensors").unlink()
+    (rooms_copy / "office" / "gaussians.ply").write_bytes(b"ply\n")
+    found = Library(rooms_copy / "library").verify()
+    assert found.keys() == {"kitchen", "office"}
+    assert "language.safetensors" in found["kitchen"]
+    assert "gaussians.ply" in found["office"]
+
+
+def test_a_change_of_a_moved_library_leaves_nothing_at_its_old_place(rooms_copy):
+    library = Library(rooms_copy / "library")
+    library.root.rename(rooms_copy / "moved")
+    for change in (
+        lambda: library.add(rooms_copy / "kitchen"),
+        lambda: library.remove("kitchen"),
+        lambda: library.verify(repair=True),
+    ):
+        with pytest.raises(LibraryError, match="moved or deleted"):
+            change()
+        assert not library.root.exists()
+    (rooms_copy / "moved").rename(library.root)
+    assert library.verify() == {}
+
+
 def test_verify_finds_a_rebuilt_scene_whose_file_has_kept_size_and_time(rooms_copy):
     library, path = Library(rooms_copy / "library"), rooms_copy / "kitchen" / "scene.json"
     times = path.stat()

@@ -27,6 +27,7 @@ from lexsplat.queries.selection import Selection
 from lexsplat.queries.visibility import whole_things, with_remains
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.scenes.filling import Fill, fill_for
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
@@ -279,7 +280,10 @@ class Editor:
             )
         folder = SceneFolder(output)
         record = json.loads(json.dumps(source.record))
-        record["edits"] = [str(step) for step in self.steps]
+        record["edits"] = [*record.get("edits", ()), *map(str, self.steps)]
+        record["edits_fingerprint"] = fingerprint(
+            record.get("edits_fingerprint"), [step.to_json() for step in self.steps]
+        )
         record["stages"].get("reconstruct", {})["gaussians"] = len(self.scene.gaussians)
         stages, record["stages"] = record["stages"], {}
         folder.record = record

@@ -55,10 +55,8 @@ from lexsplat.scenes.serving import counted
 
 COMPARED = (*everyday_words(), *CANONICAL_PHRASES)
 """Texts that every question is compared with."""
-_OPEN_SCENES = 16
-"""Scenes that stay open, at most."""
-_KEPT_CONTENTS = 512
-"""Scenes whose segments and objects stay mapped, at most."""
+_OPEN_SCENES, _KEPT_CONTENTS = 16, 512
+"""Scenes that stay open, and scenes whose segments and objects stay mapped, at most."""
 
 
 class Library:
@@ -71,10 +69,11 @@ class Library:
 
     Raises:
         LibraryError: If there is no library, or one of another format version.
+        BackendError, ValueError: If the device is not there, or none of the three.
     """
 
     def __init__(self, root: str | Path, device: str = "auto", index: str | None = None) -> None:
-        self.root, self._device = Path(root), device
+        self.root, self._device = Path(root), choose_device(device)
         self.stage = self.root / "scenes"
         """The folder of the entries."""
         name = library_name(self.root)
@@ -227,7 +226,7 @@ class Library:
 
     def _open(self, path: Path) -> Scene:
         """A scene that shares text embeddings and encoders with the others."""
-        found = read_scene(path, choose_device(self._device))
+        found = read_scene(path, self._device)
         clip = found.folder.record.get("config", {}).get("clip", "bundled")
         known = found.folder.record["stages"].get("features", {}).get("clip_hash", "")
         encode = functools.partial(self.encode, known, clip)
@@ -257,7 +256,7 @@ class Library:
 
     def _tower(self, clip: str) -> TextTower:
         if clip not in self._towers:
-            self._towers[clip] = load_text(clip, choose_device(self._device))
+            self._towers[clip] = load_text(clip, self._device)
         return self._towers[clip]
 
     def embed(self, content_hash: str, clip: str, texts: list[str]) -> Tensor:
@@ -271,8 +270,9 @@ class Library:
         """Lock the library for a change, and remove what killed writers left.
 
         Raises:
-            LibraryError: If another process changes it, or nothing can be written.
+            LibraryError: If another process changes it, nothing can be written, or it was moved or deleted.
         """
+        self.names()
         with telling_errors(self.root), locked(self.root, lambda holder: in_use(self.root, holder)):
             self._sweep()
             # Asked before anything is changed: whether the server holds what the library holds.
@@ -413,7 +413,7 @@ class Library:
             confirm: Search the scenes themselves, even where the index suffices.
 
         Raises:
-            QueryError: If the phrase is empty.
+            QueryError: If the phrase is empty, or there are several.
             LibraryError: If the server cannot answer.
         """
         return search(self, phrase, limit, confirm)

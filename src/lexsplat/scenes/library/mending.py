@@ -18,6 +18,7 @@ from lexsplat.scenes.library.records import (
     scenes_without_record,
     write_record,
 )
+from lexsplat.scenes.reading import read_scene
 
 if TYPE_CHECKING:
     from lexsplat.scenes.library.library import Library
@@ -98,9 +99,12 @@ def _problem(library: Library, name: str) -> str:
             raise damaged(path, "the copy of the record", "another one")
         if record.contents:
             map_contents(library.stage / record.contents_file, record.contents)
-        return rebuilt(library, record) if library.is_rebuilt(record, thoroughly=True) else ""
+        if library.is_rebuilt(record, thoroughly=True):
+            return rebuilt(library, record)
+        read_scene(library.folder(record), "cpu")
     except LexsplatError as error:
         return str(error)
+    return ""
 
 
 def rebuilt(library: Library, record: Record) -> str:

@@ -105,8 +105,10 @@ class Record:
 
 
 def state_of(folder: SceneFolder) -> str:
-    """A hash that changes with every build of a scene; its scale and its name do not matter."""
-    return fingerprint(folder.record["stages"])
+    """A hash that changes with every build and edit of a scene; its scale and its name do not matter."""
+    record = folder.record
+    edits = [record["edits"], record.get("edits_fingerprint")] if "edits" in record else []
+    return fingerprint(record["stages"], *edits)
 
 
 def stamp_of(folder: Path) -> str:
@@ -154,7 +156,7 @@ def _checked(content: Any, path: Path) -> Record:
             raise ValueError("other values")
         return Record(**values)
     except (KeyError, TypeError, ValueError, RecursionError) as error:
-        found = str(error) if type(error) is ValueError else repr(error)
+        found = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise damaged(path, "the record of a scene", found[:80]) from error
 
 

@@ -45,9 +45,12 @@ _NAMED = 3
 
 def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> Found:
     """The scenes of a library that hold what a phrase names (`Library.search`)."""
-    if limit < 1:
-        raise QueryError("limit", expected="at least 1", found=str(limit))
-    asking = _Asking(library, check_prompts(phrase)[0], confirm)
+    if not isinstance(limit, int) or limit < 1:
+        raise QueryError("limit", expected="a whole number of at least 1", found=repr(limit)[:40])
+    prompts = check_prompts(phrase)
+    if len(prompts) > 1:
+        raise QueryError("phrase", expected="one phrase", found=f"{len(prompts)}", remedy="search one by one")
+    asking = _Asking(library, prompts[0], confirm)
     asked_for = understand(asking.text)
     possible = candidates(library, asked_for.phrase)
     skipped, asked, opened = possible.skipped, 0, 0
