@@ -55,6 +55,8 @@ def test_only_instances_that_answer_about_as_well_as_the_best_convince(balls):
     assert len(kept.convincing()) == len(kept)
     alone = Selection(balls.gaussians, balls.cameras, labels == 1, scores, threshold=0.4)
     assert len(alone.convincing()) == 200, "the best one is never left out"
+    by_themselves = torch.tensor([0.3, 0.2, 0.1, 0.1, 0.1])[labels]  # below the threshold of the segments
+    assert torch.equal(chosen.convincing(by_themselves).mask, labels == 0), "not even then"
 
 
 def test_operators_are_those_of_sets(balls):

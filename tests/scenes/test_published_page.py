@@ -12,7 +12,7 @@ import torch
 from scipy.ndimage import binary_erosion
 from support.page_browser import CHROMIUM, ask, open_page, picture, serving, until
 
-from lexsplat.queries.vocabulary import thing_of_part
+from lexsplat.queries.vocabulary import COLORS, thing_of_part
 from lexsplat.rendering import render
 from lexsplat.scenes.scene import Scene, open_scene
 
@@ -145,6 +145,30 @@ def test_free_phrases_have_the_scores_and_segments_of_python(page, demo):
         assert answer["presence"] == asked.presences[number], answer["phrase"]
         assert np.array_equal(scores >= 0.5, expected >= 0.5), answer["phrase"]
         assert np.abs(scores - expected).max() <= 1 / 255, answer["phrase"]
+
+
+def test_things_with_a_color_have_the_places_of_python(page, demo):
+    """Places are compared by the scores of each splat by itself: "black lamp" is not two lamps."""
+    nouns = ("apple", "mug", "vase", "lamp", "bottle", "pumpkin", "teddy bear")
+    prompts = [f"{color} {noun}" for color in sorted(COLORS) for noun in nouns]
+    prompts.remove("brown lamp")  # its shade and its foot touch, and Python alone parts what touches
+    found = page.evaluate(
+        """async (prompts) => {
+            const answers = [];
+            for (const prompt of prompts) {
+                const answer = await lexsplat.app.source.answer(prompt, "#fff");
+                await lexsplat.app.source.refine(answer);
+                answers.push({ phrase: answer.phrase, presence: answer.presence, places: answer.places.length });
+            }
+            return answers;
+        }""",
+        prompts,
+    )
+    asked = demo.ask([answer["phrase"] for answer in found])
+    there = [number for number, answer in enumerate(found) if answer["presence"] != "no"]
+    assert len(there) > 10
+    expected = {prompts[number]: asked.selection(number).count for number in there}
+    assert {prompts[number]: found[number]["places"] for number in there} == expected
 
 
 KIND = """async (prompt) => {

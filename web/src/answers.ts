@@ -16,6 +16,8 @@ export interface Answer {
   /** "dictionary", "text tower", "server", or "click" for what was clicked. */
   from: string;
   scores: Float32Array;
+  /** Scores of each splat by itself, by which places are compared; null where they are `scores`. */
+  own: Float32Array | null;
   presence: Presence;
   automatic: number;
   threshold: number;
@@ -43,8 +45,8 @@ export type Found = Pick<Answer, "phrase" | "from" | "scores" | "presence" | "th
 /** An answer as it is first shown. */
 export function answered(prompt: string, color: string, found: Found): Answer {
   const fresh = {
-    note: "", unknown: false, hidden: false, anyway: false, places: null, members: null, parts: null, beyond: "", offers: [],
-    place: 0, asked: null,
+    note: "", unknown: false, hidden: false, anyway: false, own: null, places: null, members: null, parts: null, beyond: "",
+    offers: [], place: 0, asked: null,
   };
   return { ...fresh, prompt, color, automatic: found.threshold, ...found };
 }

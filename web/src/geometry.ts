@@ -123,25 +123,30 @@ export class Geometry {
 
   /**
    * The places that a threshold selects, the surest first: connected cells of a grid, without specks and without
-   * clusters that score far worse than the best one.
+   * clusters of which these scores are far worse than those of the best one; null compares none.
    */
-  places(scores: Float32Array, threshold: number): Place[] {
+  places(scores: Float32Array, threshold: number, compared: Float32Array | null = scores): Place[] {
     const chosen: number[] = [];
     for (let i = 0; i < this.count; i++) if (scores[i] >= threshold) chosen.push(i);
     if (chosen.length === 0) return [];
     const clusters = this.#clusters(chosen).map((splats) => ({
       splats,
       mass: splats.reduce((sum, i) => sum + this.opacities[i], 0),
-      peak: mean(largest(scores, splats, this.rule.peak_count).map((i) => scores[i])),
+      peak: this.#peak(scores, splats),
     }));
     const most = Math.max(...clusters.map((cluster) => cluster.mass));
     const firm = clusters.filter((cluster) => cluster.mass >= this.rule.smallest_share * most);
-    const best = Math.max(...firm.map((cluster) => cluster.peak));
-    const limit = odds(threshold) + this.rule.convincing * (odds(best) - odds(threshold));
+    const heights = firm.map(({ splats, peak }) => (compared === scores ? peak : this.#peak(compared ?? scores, splats)));
+    const best = odds(Math.max(...heights));
+    const limit = Math.min(best, odds(threshold) + this.rule.convincing * (best - odds(threshold)));
     return firm
-      .filter((cluster) => odds(cluster.peak) >= limit)
+      .filter((_, n) => !compared || odds(heights[n]) >= limit)
       .sort((a, b) => b.peak * Math.sqrt(b.mass) - a.peak * Math.sqrt(a.mass))
       .map(({ splats }) => this.place(splats));
+  }
+
+  #peak(scores: Float32Array, splats: number[]): number {
+    return mean(largest(scores, splats, this.rule.peak_count).map((i) => scores[i]));
   }
 
   /** The place where scores are best, however low they are. */

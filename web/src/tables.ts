@@ -169,9 +169,9 @@ export class Tables implements Source {
   /** By segments, something would always be taken: what is not here keeps the scores of single splats. */
   async #whole(phrase: string, own: Float32Array, presence: Presence) {
     const { threshold } = this.geometry.rule;
-    if (!this.segments || presence === "no") return { scores: own, presence, threshold };
+    if (!this.segments || presence === "no") return { scores: own, own, presence, threshold };
     const whole = this.segments.scores(own);
-    return { scores: (await this.#cut(phrase, own, whole, this.segments)) ?? whole, presence, threshold };
+    return { scores: (await this.#cut(phrase, own, whole, this.segments)) ?? whole, own, presence, threshold };
   }
 
   /** Scores of a part, cut within its thing; null for what is none, or whose thing is not here. */
@@ -197,7 +197,8 @@ export class Tables implements Source {
     }
     const hidden = this.segments?.hidden;
     const seen = (place: Place): Place => (hidden ? { ...place, splats: place.splats.filter((i) => !hidden[i]) } : place);
-    const found = painted(answer) ? this.geometry.places(answer.scores, answer.threshold) : [];
+    const compared = answer.threshold === answer.automatic ? (answer.own ?? answer.scores) : null;
+    const found = painted(answer) ? this.geometry.places(answer.scores, answer.threshold, compared) : [];
     answer.places = found.map(seen).filter(({ splats }) => splats.length > 0);
   }
 

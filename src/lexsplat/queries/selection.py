@@ -275,7 +275,7 @@ class Selection:
             float(compared[one.indices].topk(min(PEAK_COUNT, len(one))).values.mean())
             for one in self.instances
         ]
-        limit = self.convincing_limit(max(peaks))
+        limit = min(self.convincing_limit(max(peaks)), max(peaks))  # the best one stays
         kept = tuple(instance for peak, instance in zip(peaks, self.instances) if peak >= limit)
         return replace(self, mask=union(self.mask, kept), parts=kept)
 
