@@ -68,7 +68,9 @@ def test_move_changes_only_the_selected_gaussians(base):
     editor.move(chosen, Motion(translation=(1.0, 0, 0), rotation=turn, scale=2.0))
     after, before = editor.scene.gaussians, scene.gaussians
     offset = before.means[labels == 2].numpy() - chosen.center
-    expected = chosen.center + [1.0, 0, 0] + 2 * np.stack([-offset[:, 1], offset[:, 0], offset[:, 2]], 1)
+    lift = chosen.box.half_sizes[2] * chosen.up.direction  # what stands on something stands there enlarged
+    turned = np.stack([-offset[:, 1], offset[:, 0], offset[:, 2]], 1)
+    expected = chosen.center + [1.0, 0, 0] + lift + 2 * turned
     assert after.means[labels == 2].numpy() == pytest.approx(expected, abs=1e-5)
     assert torch.allclose(after.scales[labels == 2], 2 * before.scales[labels == 2])
     for name, tensor in before.tensors().items():
@@ -315,7 +317,9 @@ def test_a_moved_thing_is_found_whole_where_it_is_now(demo, tmp_path, motion):
         found = scene.find("mug")
         assert (found.present, found.count) == ("yes", 1)
         assert len(found) == len(before)
-        assert np.allclose(found.center, before.center + motion.translation, atol=0.1)
+        assert np.allclose(found.center[:2], (before.center + motion.translation)[:2], atol=0.1)
+        bottom, bottom_before = (each.center[2] - each.box.half_sizes[2] for each in (found, before))
+        assert abs(bottom - bottom_before) < 0.1, "it stands where it stood"
 
 
 @pytest.mark.slow
@@ -327,6 +331,39 @@ def test_what_closes_a_hole_is_no_thing(demo, phrase, others):
     found = editor.scene.find(phrase)
     assert found.present != "yes" or found.count == 0
     assert {name: editor.scene.find(name).count for name in others} == others
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phrase", ["toy car", "stack of books", "vase"])
+def test_what_stands_on_a_table_still_does_when_another_thing_is_deleted(demo, phrase):
+    """The fill is denser than the table: it moves neither its ends nor the distance at which it is linked."""
+
+    def on_it(scene):
+        return sorted(each.phrase for each in scene.find("what is on the table").instances)
+
+    editor = Editor(demo)
+    editor.delete(demo.find(phrase))
+    assert on_it(editor.scene) == [name for name in on_it(demo) if name != phrase]
+    assert np.allclose(sorted(editor.scene.find("table").size), sorted(demo.find("table").size), atol=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phrase", ["table lamp", "stack of books", "toy car"])
+def test_what_was_deleted_is_not_there(demo, phrase):
+    editor = Editor(demo)
+    editor.delete(demo.find(phrase))
+    assert editor.scene.find(phrase).present == "no"
+    assert phrase not in [each.phrase for each in editor.scene.objects]
+
+
+@pytest.mark.slow
+def test_copies_change_nothing_about_what_was_there(demo):
+    editor, names = Editor(demo), ("apple", "red apple", "rubber duck", "mug")
+    editor.duplicate(demo.find("red apple"), Motion((1.3, 0, 0)))
+    editor.duplicate(editor.scene.find("rubber duck"), Motion((-1, -0.3, 0), scale=0.5))
+    for name in names:
+        before = demo.find(name).mask
+        assert torch.equal(editor.scene.find(name).mask[: len(before)], before), name
 
 
 @pytest.mark.slow
@@ -347,6 +384,22 @@ def test_copies_are_segments_of_their_own():
     assert both.labels.tolist() == [0, 1, 2, 2, 3, 4, 4]
     assert both.levels.tolist() == [[0, 1, 2, 3, 4], [0, 0, 1, 3, 4], [0, 0, 0, 3, 3]]
     assert both.masses.tolist() == [0, 1, 2, 3, 1, 2, 3]
+
+
+def test_a_group_of_which_a_part_is_copied_holds_the_copy():
+    segments = Segments(torch.tensor([0, 1, 1]), torch.ones(3), torch.tensor([[0, 1], [0, 0]]))
+    both = segments.with_copy(torch.tensor([True, False, False]))
+    assert both.labels.tolist() == [0, 1, 1, 2]
+    assert both.levels[:, 2].tolist() == [2, 0], "a thing of its own, in the group of the other"
+
+
+def test_fills_are_told_apart_when_segments_are_read_again():
+    hidden = torch.tensor([False, True, True])
+    fields = torch.zeros(3).long(), torch.ones(3), torch.zeros(1, 1).long(), hidden
+    for added in (None, torch.tensor([False, False, True])):
+        again = Segments.from_tensors(Segments(*fields, added).tensors())
+        assert again.hidden.tolist() == hidden.tolist()
+        assert (again.added is None) if added is None else torch.equal(again.added, added)
 
 
 @pytest.mark.slow

@@ -12,6 +12,8 @@ export interface Place {
   splats: number[];
 }
 
+/** In `Geometry.hidden`, a splat of a fill: it is denser than what photos show, so its spacing does not count. */
+const FILL = 2;
 /** Splats that are linked, at most; the others of a larger selection join them. */
 const MOST_LINKED = 20_000;
 
@@ -24,6 +26,8 @@ export class Geometry {
   readonly colors: Float32Array;
   /** Brightness of each splat, 0..1. */
   readonly lights: Float32Array;
+  /** Which splats no photo shows, as in `Segments`; null where that is not known. */
+  hidden: Uint8Array | null = null;
   readonly #scales: Float32Array;
   readonly #quats: Float32Array;
 
@@ -166,7 +170,8 @@ export class Geometry {
     const all = firm.length ? firm : chosen;
     const step = Math.ceil(all.length / MOST_LINKED);
     const makers = step > 1 ? all.filter((_, n) => n % step === 0) : all;
-    const link = this.rule.link * this.spacing(makers);
+    const usual = this.hidden ? makers.filter((i) => this.hidden![i] !== FILL) : makers;
+    const link = this.rule.link * this.spacing(usual.length ? usual : makers);
     const grid = new Grid(this.centers, makers, link);
     const parents = new Map<number, number>(makers.map((i) => [i, i]));
     const root = (i: number): number => {

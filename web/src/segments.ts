@@ -22,7 +22,7 @@ export class Segments {
   readonly #sums: Float64Array;
   /** 1 - u_G of each splat: low where the views disagree. */
   readonly #certainties: Float32Array;
-  /** 1 for each splat that no view shows; selections leave it out. */
+  /** 1 for each splat that no view shows, 2 for those of fills; selections leave both out. */
   readonly hidden: Uint8Array;
 
   /** `content` is L and S, the levels [L, S], the labels [N], the masses [N], u_G [N] and `hidden` [N] (lexsplat.scenes.publishing.sidecar). */

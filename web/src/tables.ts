@@ -34,6 +34,7 @@ export class Tables implements Source {
     /** Whether the encoder knows English words alone. */
     readonly englishOnly: boolean,
   ) {
+    geometry.hidden = segments?.hidden ?? null;
     this.#shown = shownSplats(geometry.opacities, geometry.rule.evidence_faint);
     dictionary.rank(language, this.#shown);
     this.examples = dictionary.examples(4);

@@ -76,7 +76,7 @@ class Edit:
         strength: Share of the new color, in 0..1.
         by: Shift in units of the scene, for move and duplicate.
         turn: Degrees about the up direction, counterclockwise from above.
-        scale: Factor on the size.
+        scale: Factor on the size; the bottom stays at its height.
         output: The new scene folder, for save.
         yes: Discard all steps without asking.
         clip: Text encoder: a name on the Hugging Face Hub or a folder.

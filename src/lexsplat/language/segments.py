@@ -46,6 +46,10 @@ _MERGE_UNITS = 10
 _REPORTED = 256
 """Merges between two reports."""
 _PREFIX = "segments."
+_MOSTLY = 0.5
+"""Share of a segment's visible weight, of which a copy is one of the segment."""
+_ADDED = 2
+"""In the tensor "hidden", the Gaussians of fills."""
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -61,12 +65,15 @@ class Segments:
         levels: Segment at each level of each lowest segment ``[L, S]`` int64, the lowest level first.
         hidden: Gaussians that the training views hardly show ``[N]`` bool, where they are not as geometry and masses
             say, as after an edit; None leaves that to `lexsplat.queries.visibility`.
+        added: Those of fills (`lexsplat.scenes.filling`) ``[N]`` bool, which are hidden; None for none. They are denser
+            than what photos show, so that their spacing does not count.
     """
 
     labels: Tensor
     masses: Tensor
     levels: Tensor
     hidden: Tensor | None = None
+    added: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.labels.ndim != 1 or self.masses.shape != self.labels.shape or self.levels.ndim != 2:
@@ -81,8 +88,9 @@ class Segments:
                 raise ValueError(f"{name} must be in 0..{self.levels.shape[1] - 1}")
         if self.masses.numel() and float(self.masses.min()) < 0:
             raise ValueError("masses must not be negative")
-        if self.hidden is not None and self.hidden.shape != self.labels.shape:
-            raise ValueError(f"hidden [N] expected, got {list(self.hidden.shape)}")
+        for name, mask in (("hidden", self.hidden), ("added", self.added)):
+            if mask is not None and mask.shape != self.labels.shape:
+                raise ValueError(f"{name} [N] expected, got {list(mask.shape)}")
 
     def __repr__(self) -> str:
         levels, lowest = self.levels.shape
@@ -90,19 +98,30 @@ class Segments:
 
     def select(self, index: Tensor) -> Segments:
         """The segments of some Gaussians, with the same numbers."""
-        hidden = None if self.hidden is None else self.hidden[index]
-        return Segments(self.labels[index], self.masses[index], self.levels, hidden)
+        hidden, added = (None if mask is None else mask[index] for mask in (self.hidden, self.added))
+        return Segments(self.labels[index], self.masses[index], self.levels, hidden, added)
 
     def with_copy(self, mask: Tensor) -> Segments:
-        """The segments after a copy of some Gaussians ``[N]`` bool is appended, which gets segments of its own."""
+        """The segments after a copy of some Gaussians ``[N]`` bool is appended.
+
+        What is copied for the most part gets segments of its own. A group of which a part is copied holds the copy, too:
+        a group that is the copy alone would make groups better answers than things.
+        """
         index = torch.cat([torch.arange(len(self.labels), device=mask.device), mask.nonzero()[:, 0]])
         both, first = self.select(index), self.levels.shape[1]
+        total, copied = (
+            torch.zeros(first, device=mask.device).index_add_(0, self.labels[some], self.masses[some] + 1e-6)
+            for some in (slice(None), mask)
+        )
         sources, copies = self.labels[mask].unique(return_inverse=True)
-        levels = [
-            torch.cat([level, first + level[sources].unique(return_inverse=True)[1]]) for level in self.levels
-        ]
+        whole, levels = torch.ones_like(sources, dtype=torch.bool), []
+        for level in self.levels:
+            sums = [torch.zeros_like(total).index_add_(0, level, part) for part in (copied, total)]
+            whole &= (sums[0] >= _MOSTLY * sums[1])[level[sources]]
+            own = first + level[sources].unique(return_inverse=True)[1]
+            levels.append(torch.cat([level, torch.where(whole, own, level[sources])]))
         labels = torch.cat([self.labels, first + copies])
-        return Segments(labels, both.masses, torch.stack(levels), both.hidden)
+        return Segments(labels, both.masses, torch.stack(levels), both.hidden, both.added)
 
     def tensors(self) -> dict[str, Tensor]:
         """For safetensors: 4 bytes a Gaussian if there are at most 65,536 segments."""
@@ -112,7 +131,11 @@ class Segments:
             _PREFIX + "masses": self.masses.clamp(max=6e4).half(),
             _PREFIX + "levels": self.levels.to(torch.int32),
         }
-        return found if self.hidden is None else {**found, _PREFIX + "hidden": self.hidden.to(torch.uint8)}
+        if self.hidden is not None:
+            found[_PREFIX + "hidden"] = self.hidden.to(torch.uint8)
+            if self.added is not None:
+                found[_PREFIX + "hidden"] += self.added
+        return found
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Segments | None:
@@ -133,6 +156,7 @@ class Segments:
             found["masses"].float(),
             found["levels"].long(),
             None if hidden is None else hidden.bool(),
+            None if hidden is None or not bool((hidden == _ADDED).any()) else hidden == _ADDED,
         )
 
 

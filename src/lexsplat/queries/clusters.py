@@ -32,12 +32,15 @@ def spacing(points: FloatArray) -> float:
     return float(np.median(_tree(points).query(sample, k=min(_SIXTH + 1, len(points)))[0][:, -1]))
 
 
-def clusters(points: FloatArray, firm: NDArray[np.bool_]) -> NDArray[np.intp]:
+def clusters(
+    points: FloatArray, firm: NDArray[np.bool_], counted: NDArray[np.bool_] | None = None
+) -> NDArray[np.intp]:
     """The cluster of each point ``[M]``, numbered from 0.
 
     Args:
         points: ``[M, 3]``.
         firm: Which of them link others ``[M]``; all do if none is firm.
+        counted: Which of them tell the usual spacing ``[M]``; None takes all.
     """
     count = len(points)
     if count < 2:
@@ -46,7 +49,10 @@ def clusters(points: FloatArray, firm: NDArray[np.bool_]) -> NDArray[np.intp]:
     threads = torch.get_num_threads() if count >= _MANY else 1
     searched = min(_SEARCHED, count)
     apart, found = _tree(points).query(points, k=searched, workers=threads)
-    link = LINK * float(np.median(apart[:: max(1, count // _SAMPLE), min(_SIXTH + 1, count) - 1]))
+    spacings = apart[:, min(_SIXTH + 1, count) - 1]
+    if counted is not None and counted.any():
+        spacings = spacings[counted]
+    link = LINK * float(np.median(spacings[:: max(1, len(spacings) // _SAMPLE)]))
     is_firm = firm[found]
     order = np.cumsum(is_firm, axis=1)
     linked = is_firm & (apart < link) & (order <= _NEIGHBORS + 1)  # each is its own nearest

@@ -179,7 +179,7 @@ def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
         foot = upper.only(upper.heights <= bottom + _FOOT * (top - bottom))
         near = _near(lower.only(lower.heights <= middle), *foot.disc)
         level = _is_level(lower) and float(np.quantile(lower.heights, 0.9)) <= middle
-        if not _surrounds(near, foot) and not (level and (overlapping or _surrounds(lower, foot, _TAIL))):
+        if not _surrounds(near, foot) and not (level and (overlapping or _reaches_over(lower, foot))):
             return np.inf, top - bottom
         surfaces = np.quantile(near.heights, [0.5, 0.9, 0.98])
     else:
@@ -197,6 +197,13 @@ def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
 def _is_level(body: Body) -> bool:
     low, high = body.span(0.1)
     return high - low <= _LEVEL * body.width
+
+
+def _reaches_over(surface: Body, foot: Body) -> bool:
+    """Whether part of a foot lies within a level surface, whose edge photos may not show."""
+    inward = surface.center - foot.center
+    step = inward * min(1.0, foot.width / max(float(np.linalg.norm(inward)), 1e-12))
+    return _surrounds(surface, Body(foot.plan + step, foot.heights), _TAIL)
 
 
 def _surrounds(surface: Body, part: Body, beyond: float = _BEYOND) -> bool:

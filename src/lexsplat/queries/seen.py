@@ -74,6 +74,11 @@ class Seen:
             return known.to(self._gaussians.device)
         return hidden_gaussians(self._gaussians, self._training, self._segments.masses)
 
+    def counted(self, indices: Tensor) -> NDArray[np.bool_] | None:
+        """Which of some Gaussians ``[M]`` belong to no fill (`lexsplat.language.segments`); None without fills."""
+        added = self._segments.added
+        return None if added is None else ~added.cpu()[indices.cpu()].numpy()
+
     @property
     def complete(self) -> bool:
         """Whether all views are known, so that no question renders any."""

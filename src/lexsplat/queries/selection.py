@@ -407,7 +407,8 @@ class Selection:
         """Cluster of each selected Gaussian ``[M]`` and the total opacity of each cluster ``[C]``."""
         points, opacities = self._points()
         firm = opacities >= FAINT
-        labels = divided(points, firm, clusters(points, firm), self.up.direction)
+        counted = None if self.seen is None else self.seen.counted(self.indices)
+        labels = divided(points, firm, clusters(points, firm, counted), self.up.direction)
         return labels, np.bincount(labels, weights=opacities).astype(np.float64)
 
 

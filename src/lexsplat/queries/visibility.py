@@ -87,8 +87,8 @@ def without_hidden(chosen: Selection, hidden: Tensor) -> Selection:
 def whole_things(chosen: Selection, hidden: Tensor, segments: Segments | None) -> Selection:
     """A selection extended by the borders of its things and the hidden Gaussians in them.
 
-    A segment belongs to it if half of what the views show of the segment is selected. A hidden Gaussian belongs to it
-    if two of its six nearest neighbors that can be seen do, and it lies within the convex hull of a thing.
+    A segment belongs to it if half of what the views show of the segment does. A hidden Gaussian belongs to it if two
+    of its six nearest neighbors that can be seen do, and it lies within the convex hull of a thing.
 
     Args:
         chosen: The selection.
@@ -98,7 +98,8 @@ def whole_things(chosen: Selection, hidden: Tensor, segments: Segments | None) -
     if segments is None or not chosen:
         return chosen
     shown = _with_borders(chosen, segments)
-    return replace(shown, mask=shown.mask | inside_hulls(shown, _beside(shown, hidden)))
+    whole = replace(shown, mask=shown.mask | inside_hulls(shown, _beside(shown, hidden)))
+    return _with_borders(whole, segments)
 
 
 @torch.no_grad()
@@ -108,10 +109,11 @@ def with_remains(chosen: Selection, hidden: Tensor, segments: Segments | None) -
     Beyond `whole_things`, it has every hidden Gaussian within their hulls, such as what is in a mug, and those beside
     them outside their hulls, such as below a foot.
     """
-    if segments is not None and chosen:
-        shown = _with_borders(chosen, segments)
-        chosen = replace(shown, mask=shown.mask | _beside(shown, hidden))
-    return replace(chosen, mask=chosen.mask | inside_hulls(chosen, hidden))
+    if segments is None or not chosen:
+        return replace(chosen, mask=chosen.mask | inside_hulls(chosen, hidden))
+    shown = _with_borders(chosen, segments)
+    whole = replace(shown, mask=shown.mask | _beside(shown, hidden))
+    return _with_borders(replace(whole, mask=whole.mask | inside_hulls(whole, hidden)), segments)
 
 
 def _with_borders(chosen: Selection, segments: Segments) -> Selection:

@@ -93,8 +93,11 @@ def _without(
         name: torch.cat([tensor, getattr(added, name)]) for name, tensor in remain.tensors().items()
     }
     language = language.select(torch.cat([kept.nonzero()[:, 0], sources]))
-    if language.segments is not None and language.segments.hidden is not None:
-        language.segments.hidden[len(remain) :] = False
+    if (segments := language.segments) is not None and segments.hidden is not None:
+        new = torch.arange(len(segments.labels), device=segments.labels.device) >= len(remain)
+        added = new if segments.added is None else segments.added | new
+        segments = replace(segments, masses=segments.masses * ~new, hidden=segments.hidden | new, added=added)
+        language = _with_segments(language, segments)
     return replace(remain, **tensors), language
 
 
@@ -136,10 +139,10 @@ def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> 
 
 @dataclass(frozen=True)
 class Motion:
-    """A similarity transform of a selection about the center c of its box: x -> scale R (x - c) + c + translation.
+    """A similarity transform of a selection about the center c of its box: x -> scale R (x - c) + c + t.
 
     Args:
-        translation: ``[3]``, world units.
+        translation: ``[3]``, world units. t is this and what keeps the bottom of the box at its height.
         rotation: R ``[3, 3]``, a proper rotation; None is the identity.
         scale: Factor on sizes, positive.
     """
@@ -150,10 +153,13 @@ class Motion:
 
     def values(self, chosen: Selection) -> dict[str, Any]:
         """The numbers of a `Step` that moves ``chosen``."""
+        center, lift = np.zeros(3), np.zeros(3)
+        if chosen:
+            center, lift = chosen.center, (self.scale - 1) * chosen.box.half_sizes[2] * chosen.up.direction
         vectors = {
             "rotation": np.eye(3) if self.rotation is None else self.rotation,
-            "translation": self.translation,
-            "center": chosen.center if chosen else np.zeros(3),
+            "translation": np.asarray(self.translation, float) + lift,
+            "center": center,
         }
         numbers = {name: np.asarray(value, float).tolist() for name, value in vectors.items()}
         return {**numbers, "scale": float(self.scale)}

@@ -210,8 +210,8 @@ def _scene_parts(scene: Scene) -> Iterator[bytes]:
     gaussians, segments = scene.gaussians, scene.field.segments
     tensors = [gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacity_logits]
     of_segments = [segments.labels, segments.masses, segments.levels] if segments else []
-    if segments and segments.hidden is not None:
-        of_segments.append(segments.hidden)
+    if segments:
+        of_segments += [mask for mask in (segments.hidden, segments.added) if mask is not None]
     for tensor in [*tensors, *of_segments]:
         yield np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes()
     for name, view in scene.views.items():

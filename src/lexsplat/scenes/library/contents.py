@@ -249,13 +249,16 @@ def _neighbors(scene: Scene, segments: Segments) -> dict[str, Tensor]:
     count, labels = segments.levels.shape[1], segments.labels.numpy()
     opacities = scene.gaussians.opacities.detach().cpu().double().numpy()
     seen = ~scene.hidden.cpu().numpy()
+    # Hidden Gaussians link a lamp and its foot; those of fills link nothing.
     firm = np.flatnonzero(opacities >= _FAINT)  # hidden Gaussians link a lamp and its foot
+    added = scene.field.segments.added if scene.field.segments else None  # denser than what photos show
     means, of = scene.gaussians.means.detach().cpu().double().numpy()[firm], labels[firm]
     spacings, pairs, gaps = np.zeros(count), np.zeros((0, 2), np.int64), np.zeros(0)
     if len(firm) > 1:
         neighbors = min(_NEIGHBORS + 1, len(firm))
         apart, near = cKDTree(means).query(means, k=neighbors)
-        spacings = _medians(of, apart[:, min(6, neighbors - 1)], count)
+        counted = np.ones(len(firm), bool) if added is None else ~added.cpu().numpy()[firm]
+        spacings = _medians(of[counted], apart[counted, min(6, neighbors - 1)], count)
         first, second = np.repeat(of, neighbors), of[near.ravel()]
         between = first != second
         keys = np.minimum(first, second) * count + np.maximum(first, second)

@@ -73,14 +73,16 @@ def segments_file(segments: Segments, uncertainties: torch.Tensor, hidden: torch
 
     They are the segment at each level of each lowest segment ``[L, S]`` uint32; the lowest segment of each splat
     ``[N]`` uint16, or uint32 for more than 65,536 segments; the masses ``[N]`` float16, as the scene stores them;
-    u_G in 255ths ``[N]`` uint8, as in the scene; and 1 for each splat that no view shows, which selections leave out,
-    ``[N]`` uint8.
+    u_G in 255ths ``[N]`` uint8, as in the scene; and ``[N]`` uint8, 1 for each splat that no view shows and 2 for those
+    of fills, both of which selections leave out.
     """
     levels = segments.levels.cpu().numpy().astype("<u4")
     labels = segments.labels.cpu().numpy().astype("<u2" if levels.shape[1] <= 1 << 16 else "<u4")
     masses = segments.masses.clamp(max=6e4).cpu().numpy().astype("<f2")
     uncertain = (uncertainties.cpu() * 255).round().numpy().astype(np.uint8)
     unseen = hidden.cpu().numpy().astype(np.uint8)
+    if segments.added is not None:
+        unseen += segments.added.cpu().numpy()
     head = np.array(levels.shape, "<u4")
     return b"".join(array.tobytes() for array in (head, levels, labels, masses, uncertain, unseen))
 
