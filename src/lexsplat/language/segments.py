@@ -65,8 +65,8 @@ class Segments:
         levels: Segment at each level of each lowest segment ``[L, S]`` int64, the lowest level first.
         hidden: Gaussians that the training views hardly show ``[N]`` bool, where they are not as geometry and masses
             say, as after an edit; None leaves that to `lexsplat.queries.visibility`.
-        added: Those of fills (`lexsplat.scenes.filling`) ``[N]`` bool, which are hidden; None for none. They are denser
-            than what photos show, so that their spacing does not count.
+        added: Those of fills (`lexsplat.scenes.filling`) ``[N]`` bool, which are hidden; None for none. They are
+            denser than what photos show, so that their spacing does not count.
     """
 
     labels: Tensor
@@ -101,11 +101,17 @@ class Segments:
         hidden, added = (None if mask is None else mask[index] for mask in (self.hidden, self.added))
         return Segments(self.labels[index], self.masses[index], self.levels, hidden, added)
 
+    def with_fill(self, first: int) -> Segments:
+        """The segments where the Gaussians from a number on are those of a fill: no photo shows them."""
+        fill = torch.arange(len(self.labels), device=self.labels.device) >= first
+        hidden, added = (fill if mask is None else mask | fill for mask in (self.hidden, self.added))
+        return Segments(self.labels, self.masses * ~fill, self.levels, hidden, added)
+
     def with_copy(self, mask: Tensor) -> Segments:
         """The segments after a copy of some Gaussians ``[N]`` bool is appended.
 
-        What is copied for the most part gets segments of its own. A group of which a part is copied holds the copy, too:
-        a group that is the copy alone would make groups better answers than things.
+        What is copied for the most part gets segments of its own. A group of which a part is copied holds the copy,
+        too: a group that is the copy alone would make groups better answers than things.
         """
         index = torch.cat([torch.arange(len(self.labels), device=mask.device), mask.nonzero()[:, 0]])
         both, first = self.select(index), self.levels.shape[1]

@@ -43,8 +43,8 @@ _SHEET = 0.25
 """An upright sheet, such as a wall: its middle half is at most this thick, relative to its width and height."""
 _ATTACHED = 0.15
 """On a wall: the gap is at most this share of the thing's largest extent."""
-_POINTS = 1000
-"""About as many points of a thing are compared."""
+_POINTS, _ALL_POINTS = 1000, 1 << 14
+"""About as many points of a thing are compared, and where few points decide."""
 _ANGLES = np.radians(np.arange(0.0, 180.0, 10.0))
 _SIDES = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 """Horizontal directions ``[2, A]``."""
@@ -107,13 +107,13 @@ class Body:
         return float(low), float(high)
 
 
-def body_of(selection: Selection, up: NDArray[np.float64]) -> Body:
-    """Up to about a thousand points of a selection by their place and height; kept with the selection."""
-    kept: dict[bytes, Body] = selection.__dict__.setdefault("_bodies", {})
-    key = np.asarray(up, np.float64).tobytes()
+def body_of(selection: Selection, up: NDArray[np.float64], points: int = _POINTS) -> Body:
+    """Up to about so many points of a selection by their place and height; kept with the selection."""
+    kept: dict[tuple[bytes, int], Body] = selection.__dict__.setdefault("_bodies", {})
+    key = np.asarray(up, np.float64).tobytes(), points
     if key not in kept:
-        points = selection.sample
-        local = points[:: max(1, len(points) // _POINTS)] @ np.stack(upright_frame(up)).T
+        sample = selection.sample
+        local = sample[:: max(1, len(sample) // points)] @ np.stack(upright_frame(up)).T
         kept[key] = Body(local[:, :2], local[:, 2])
     return kept[key]
 
@@ -126,7 +126,7 @@ def rests_on(target: Selection, support: Selection, up: NDArray[np.float64]) -> 
         return _attached(upper, lower, normal) and not _supported(target, support, up)
     if not _is_higher(upper, lower):
         return False
-    gap, height = _gap(upper, lower, overlap(target, support))
+    gap, height = _gap(upper, lower, body_of(support, up, _ALL_POINTS), overlap(target, support))
     if gap <= _SUPPORT * height:
         return True
     if gap == np.inf:
@@ -168,8 +168,8 @@ def _is_higher(upper: Body, lower: Body) -> bool:
     return _near(upper, *lower.disc).middle > lower.middle
 
 
-def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
-    """The gap between a body and one below it, and the height of the upper one there.
+def _gap(upper: Body, lower: Body, whole: Body, overlapping: bool) -> tuple[float, float]:
+    """The gap between a body and one below it, of which ``whole`` has more points, and the upper one's height there.
 
     The gap is infinite where the narrower one is beside the wider one. A cloth, a shadow or the thing itself may hide
     the surface near the foot. Then all of a level surface counts: a table does, a wall or a chair does not.
@@ -179,7 +179,7 @@ def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
         foot = upper.only(upper.heights <= bottom + _FOOT * (top - bottom))
         near = _near(lower.only(lower.heights <= middle), *foot.disc)
         level = _is_level(lower) and float(np.quantile(lower.heights, 0.9)) <= middle
-        if not _surrounds(near, foot) and not (level and (overlapping or _reaches_over(lower, foot))):
+        if not _surrounds(near, foot) and not (level and (overlapping or _surrounds(whole, foot, _TAIL))):
             return np.inf, top - bottom
         surfaces = np.quantile(near.heights, [0.5, 0.9, 0.98])
     else:
@@ -197,13 +197,6 @@ def _gap(upper: Body, lower: Body, overlapping: bool) -> tuple[float, float]:
 def _is_level(body: Body) -> bool:
     low, high = body.span(0.1)
     return high - low <= _LEVEL * body.width
-
-
-def _reaches_over(surface: Body, foot: Body) -> bool:
-    """Whether part of a foot lies within a level surface, whose edge photos may not show."""
-    inward = surface.center - foot.center
-    step = inward * min(1.0, foot.width / max(float(np.linalg.norm(inward)), 1e-12))
-    return _surrounds(surface, Body(foot.plan + step, foot.heights), _TAIL)
 
 
 def _surrounds(surface: Body, part: Body, beyond: float = _BEYOND) -> bool:

@@ -93,11 +93,8 @@ def _without(
         name: torch.cat([tensor, getattr(added, name)]) for name, tensor in remain.tensors().items()
     }
     language = language.select(torch.cat([kept.nonzero()[:, 0], sources]))
-    if (segments := language.segments) is not None and segments.hidden is not None:
-        new = torch.arange(len(segments.labels), device=segments.labels.device) >= len(remain)
-        added = new if segments.added is None else segments.added | new
-        segments = replace(segments, masses=segments.masses * ~new, hidden=segments.hidden | new, added=added)
-        language = _with_segments(language, segments)
+    if language.segments is not None:
+        language = _with_segments(language, language.segments.with_fill(len(remain)))
     return replace(remain, **tensors), language
 
 

@@ -73,8 +73,8 @@ def segments_file(segments: Segments, uncertainties: torch.Tensor, hidden: torch
 
     They are the segment at each level of each lowest segment ``[L, S]`` uint32; the lowest segment of each splat
     ``[N]`` uint16, or uint32 for more than 65,536 segments; the masses ``[N]`` float16, as the scene stores them;
-    u_G in 255ths ``[N]`` uint8, as in the scene; and ``[N]`` uint8, 1 for each splat that no view shows and 2 for those
-    of fills, both of which selections leave out.
+    u_G in 255ths ``[N]`` uint8, as in the scene; and ``[N]`` uint8, 1 for each splat that no view shows and 2 for
+    those of fills, both of which selections leave out.
     """
     levels = segments.levels.cpu().numpy().astype("<u4")
     labels = segments.labels.cpu().numpy().astype("<u2" if levels.shape[1] <= 1 << 16 else "<u4")
