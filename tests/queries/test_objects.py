@@ -73,3 +73,26 @@ def test_probabilities_of_names_leave_a_rest_for_other_names():
 )
 def test_colors_are_named_by_the_weight_that_shows_them(colors, weights, words):
     assert color_words(np.array(colors), np.array(weights, float)) == words
+
+
+@pytest.mark.parametrize(
+    ("word", "names"),
+    [
+        ("blue", "#0000ff #000080 #00004d #3366e6 #87ceeb #1e90ff #4682b4 #00ffff #0080ff"),
+        ("green", "#00ff00 #008000 #90ee90 #6b8e23 #2e8b57 #008080"),
+        ("purple", "#800080 #8a2be2 #4b0082 #9966cc #ee82ee"),
+        ("red", "#ff0000 #800000 #dc143c #cd5c5c"),
+        ("yellow", "#ffff00 #ffd700 #f0e68c"),
+        ("orange", "#ffa500 #ff8c00"),
+        ("pink", "#ffc0cb #ff69b4 #ff1493"),
+        ("brown", "#8b4513 #5c4033"),
+        ("white", "#ffffff #f5f5f5 #fffff0"),
+        ("gray", "#808080 #696969 #708090"),
+        ("black", "#000000 #101010"),
+    ],
+)
+def test_well_known_colors_have_their_names(word, names):
+    """Names of CSS, such as navy, sky blue, cyan, teal, indigo, crimson, gold and slate gray."""
+    for name in names.split():
+        color = [int(name[place : place + 2], 16) / 255 for place in (1, 3, 5)]
+        assert color_words(np.array([color]), np.ones(1)) == [word], name

@@ -127,7 +127,6 @@ ANY, ME = Anything(), Viewer()
         ("where can I find the mug?", MUG),
         ("Could you please show me where the mug is?", MUG),
         ("I've lost my mug, where is it?", MUG),
-        ("hand me the mug", MUG),
         ("hand on the cloth", Related("on", Thing("hand"), CLOTH)),
         ("what can I drink from?", Thing("something to drink from")),
         ("where can I put flowers?", Thing("something to put flowers in")),

@@ -1,5 +1,6 @@
 """Relations between balls and plates at known places."""
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -120,6 +121,13 @@ def test_somebody_who_looks_straight_down_has_the_top_of_the_picture_ahead():
     frame = frame_of(look_at([0, 0, 5.0], [0, 0, 0], [0, 1.0, 0], 64, 48, 0.8), UP)
     assert frame.ahead == pytest.approx([0, 1, 0], abs=1e-9)
     assert frame.right == pytest.approx([1, 0, 0], abs=1e-9)
+
+
+def test_what_is_next_to_something_has_it_next_to_itself(select):
+    frame = frame_of(FRONT, UP)
+    for first, second in itertools.combinations(map(select, THINGS), 2):
+        assert distance(first, second) == distance(second, first)
+        assert holds("next to", first, second, frame) == holds("next to", second, first, frame)
 
 
 def test_distance_is_that_between_surfaces(select):

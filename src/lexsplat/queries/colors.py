@@ -9,9 +9,11 @@ _EXAMPLES = (
     ("black", (25, 25, 25)), ("gray", (125, 125, 125)), ("white", (225, 225, 220)), ("red", (175, 40, 35)),
     ("red", (90, 15, 15)), ("orange", (220, 115, 35)), ("yellow", (225, 195, 60)), ("green", (60, 120, 50)),
     ("green", (25, 60, 25)), ("blue", (45, 80, 165)), ("blue", (20, 35, 85)), ("purple", (115, 65, 145)),
-    ("pink", (225, 130, 165)), ("brown", (115, 75, 45)),
+    ("pink", (225, 130, 165)), ("brown", (115, 75, 45)), ("blue", (0, 0, 255)), ("blue", (0, 0, 110)),
+    ("blue", (130, 195, 240)), ("blue", (40, 190, 220)), ("green", (0, 120, 110)), ("purple", (140, 45, 225)),
+    ("purple", (75, 5, 120)), ("purple", (60, 30, 80)),
 )  # fmt: skip
-"""sRGB of words, in 0..255, in light and in shade."""
+"""sRGB of words, in 0..255, in light and in shade; blues and purples also vivid ones."""
 COLOR_WORDS = tuple(dict.fromkeys(word for word, _ in _EXAMPLES))
 """Every color that `color_words` can tell."""
 _LIGHTNESS = 0.5

@@ -85,10 +85,29 @@ _REWORDED = (
         ),
         r"\2 \1",
     ),
+    (
+        re.compile(
+            r"^(?:is|are|was|were) (?:(?:the|this|that|these|those|my|our|your) )?"
+            r"((?:(?!(?:on|in|at|to|of|near|next|under|behind|beside|between|above|below|and|or|not|there)\b)[\w-]+ ){1,4})"
+            r"(?:made|built) (?:out )?(?:of|from) (?=\w+$)",
+            re.IGNORECASE,
+        ),
+        r"is there \1made of ",
+    ),
+    (
+        re.compile(
+            r"\b((?:larg|bigg|great|hug|small|tini|tall|high|short|low|near|clos|farth|furth)est|leftmost|rightmost)"
+            rf" (\d+|{'|'.join(NUMBERS)}) (?=\w)",
+            re.IGNORECASE,
+        ),
+        r"\2 \1 ",
+    ),
 )
 _MOVES = r"(?:move|turn|drive|go|navigate|walk|fly|run|lead|guide|take)"
+_CHANGES = r"(?:delete|remove|erase|hide|clean|push|pull|lift|throw)"
 _COMMAND = re.compile(
-    rf"^(?:(?:please|plz|hey|ok|okay|now|so|{_ROBOT}|can|could|would|will|you)[\s,:!]+)*({_MOVES})\s(?:me |us )?"
+    rf"^(?:(?:please|plz|hey|ok|okay|now|so|{_ROBOT}|can|could|would|will|you)[\s,:!]+)*"
+    rf"({_MOVES}|{_CHANGES}|pick up|grab|bring|fetch|hand|give|carry)\s(?:me |us )?"
     r"(?=(?:back |over |up |down |straight )?(?:to|towards?|around|past|at|the|a|an|my|near|next|behind|in|left|right)\b)",
     re.IGNORECASE,
 )
@@ -103,6 +122,7 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (rf"(?:please|pls|plz|kindly|just(?! (?:\d|{'|'.join(NUMBERS)})\b)|hey|hi|hello|ok|okay|so|well|now|um+|sorry|excuse me|and|also)[\s,!:]+", ""),
     (rf"{_CAN} {_I} (?:please |kindly |just |ever |possibly |perhaps |maybe )*(?={_FIND}\b)", ""),
     (rf"{_MOVES} (?:around|past) (?=the|a|an|my)", ""),
+    (rf"(?:(?:can|could|would|will) you )?{_CHANGES} (?=(?:the|a|an|my|this|that|these|those|all|every)\b)", ""),
     (rf"(?:{_I} (?:want|need|wish|would like|would love|have|am trying|try|am going) (?:you )?to )(?={_FIND}\b)", ""),
     (r"(?:do you know|i wonder|i want to know|i would like to know|any idea|i am asking)(?: about)?[\s,]+(?=where|what|which|how|if)", ""),
     (r"if (?=there (?:is|are)\b)", ""),
@@ -143,6 +163,7 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:what|who) (?:does|do|did) ((?:the|my|a|an) .+?) (?:stand|sit|lie|hang|rest|lean) (?=(?:on|near|next to|close to|beside|alongside|in front of|behind)$)", r"what is \1 "),
     (r"(?:does|do|did) (?=.+ (?:stand|sit|lie|hang|rest|have)\b)", ""),
     # What and which
+    (r"what (?:is|are) (.+?) (?:made|built) (?:out )?(?:of|from)$", r"\1"),
     (rf"(?:which|what) ([\w ]+?) (?:is|are) (?:the )?({'|'.join(ORDINALS)}|\d+(?:st|nd|rd|th)) (?:one )?(?=from)", r"\2 \1 "),
     (r"(what|which) else ", r"\1 "),
     (rf"(?:what|which) {_CAN} {_I} {_SEE}(?=$| {_PLACE})", "thing"),
@@ -303,6 +324,8 @@ def not_in_answer(words: str) -> str:
     """A note on what a question asks for in addition to a thing and its place; "" if nothing."""
     if re.match(r"(?:of )?(?:what|which) colou?rs?\b.*\b(?:is|are|has|have)\b", words, re.IGNORECASE):
         return 'the answer is the thing: "lexsplat list" tells colors'
+    if re.match(r"what (?:is|are) .+ made (?:out )?(?:of|from)$", words, re.IGNORECASE):
+        return 'the answer is the thing: a material is asked for by its name, as in "mug made of metal"'
     if _HOW_LARGE.search(words):
         return 'the answer is the thing: "lexsplat find" and "lexsplat list" tell its size'
     state = _STATE.search(words) if asks_yes_or_no(words) else None

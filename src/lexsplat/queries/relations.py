@@ -103,8 +103,9 @@ def holds(relation: RelationName, target: Selection, reference: Selection, frame
         return bool(share >= _INSIDE and target.box.volume < reference.box.volume)
     if relation == "next to":
         smaller = min(np.linalg.norm(target.size[:2]), np.linalg.norm(reference.size[:2]))
-        return bool(distance(target, reference) <= _NEAR * smaller) and not is_over(
-            target, reference, frame.up
+        near = bool(distance(target, reference) <= _NEAR * smaller)
+        return near and not any(
+            is_over(*pair, frame.up) for pair in ((target, reference), (reference, target))
         )
     raise ValueError(f"not a relation between two instances: {relation!r}")
 
@@ -291,8 +292,9 @@ def distance(first: Selection, second: Selection) -> float:
     """
     if not first or not second:
         raise ValueError("an empty selection has no place")
-    apart, _ = first.tree.query(second.sample)
-    return float(np.quantile(apart, 0.002))  # one stray Gaussian does not close a gap
+    pairs = (first, second), (second, first)
+    # One stray Gaussian does not close a gap, whichever of the two has it.
+    return max(float(np.quantile(one.tree.query(other.sample)[0], 0.002)) for one, other in pairs)
 
 
 # One relation each
