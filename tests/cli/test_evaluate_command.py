@@ -77,6 +77,19 @@ def test_a_scene_folder_that_takes_no_file_is_refused_before_anything_is_measure
     fails_in_one_line(capsys, ["evaluate", str(built)], f"error: {built}: Read-only", "give another place")
 
 
+def test_photos_of_another_place_are_not_measured(built, tiny_capture, tmp_path, capsys):
+    """They have the names of the build's, as photos of cameras that count from 1 do."""
+    other = shutil.copytree(tiny_capture, tmp_path / "other")
+    images = {path.name: path for path in sorted((other / "images").iterdir())}
+    first, *rest = images.values()
+    for path in rest:
+        shutil.copy(first, path)
+    before = (built / "metrics.json").read_bytes() if (built / "metrics.json").exists() else b""
+    asked = ["evaluate", str(built), "--capture", str(other)]
+    fails_in_one_line(capsys, asked, str(other), "of 3 held-out photos changed", "--capture")
+    assert ((built / "metrics.json").read_bytes() if before else b"") == before
+
+
 def test_a_scene_without_held_out_views_says_that_nothing_is_measured(built, tmp_path, caplog):
     shutil.copytree(built, tmp_path / "scene")
     cameras = tmp_path / "scene" / "cameras.json"

@@ -251,6 +251,12 @@ def test_missing_seeds_and_unknown_variants_are_refused_before_any_work(tiny_cap
     assert not (tmp_path / "a").exists()
 
 
+@pytest.mark.parametrize("plan", [{"seeds": (1, 1)}, {"variants": ("full", "full")}, {"forms": ("code",) * 2}])
+def test_what_is_given_twice_is_refused_because_its_spread_would_be_none(plan):
+    with pytest.raises(ValueError, match="given once each; got .* more than once"):
+        AblationPlan(**plan)
+
+
 def test_a_capture_without_masks_cannot_be_ablated(ablated, tiny_capture, monkeypatch):
     empty = Annotations("segmentations", tiny_capture, {})
     monkeypatch.setattr("lexsplat.evaluation.ground_truth.load_annotations", lambda *a: empty)

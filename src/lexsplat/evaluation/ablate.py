@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lexsplat.evaluation import EvaluationConfig
-from lexsplat.evaluation.experiments import Bench, Row
+from lexsplat.evaluation.experiments import Bench, Row, require_each_once
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.methods import METHODS, FitRun, MethodName, TrainingViews
 from lexsplat.language.methods.averaged import features_of_codes
@@ -82,8 +82,8 @@ class AblationPlan:
             several.
 
     Raises:
-        ValueError: If there is no seed, form or method, the share is not within 0..1, a method is unknown, or no
-            method has a variant.
+        ValueError: If there is no seed, form or method, one is given twice, the share is not within 0..1, a method is
+            unknown, or no method has a variant.
     """
 
     seeds: Sequence[int] = (0, 1, 2)
@@ -96,6 +96,9 @@ class AblationPlan:
         if not self.seeds or not self.forms or not self.methods:
             raise ValueError("an ablation needs at least one seed, one form and one method")
         with_wrong_labels({}, self.wrong_labels, 1, 0)  # refuses an invalid share
+        require_each_once(
+            methods=self.methods, variants=self.variants, forms=self.forms, seeds=self.seeds
+        )
         unknown = [name for name in self.methods if name not in METHODS]
         if unknown:
             raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown)}")

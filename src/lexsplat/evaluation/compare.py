@@ -9,7 +9,7 @@ from typing import Any, cast
 
 from lexsplat.evaluation.ablate import language_row
 from lexsplat.evaluation.baselines import BASELINES, BaselineRun, TrainingData
-from lexsplat.evaluation.experiments import Bench, Made, Row
+from lexsplat.evaluation.experiments import Bench, Made, Row, require_each_once
 from lexsplat.language.methods import METHODS, MethodName
 from lexsplat.queries.relevancy import QueryForm, embed_prompts
 
@@ -27,7 +27,7 @@ class ComparisonPlan:
         seeds: Seeds of codebook and language; one is enough for deterministic methods.
 
     Raises:
-        ValueError: If a method is unknown, or there is no method or seed.
+        ValueError: If a method is unknown, there is no method or seed, or one is given twice.
     """
 
     methods: Sequence[str] = ("averaged", "averaged-code", "trained-feature", *BASELINES)
@@ -37,6 +37,7 @@ class ComparisonPlan:
         unknown = [name for name in self.methods if name not in COMPARED]
         if unknown or not self.methods or not self.seeds:
             raise ValueError(f"methods are {', '.join(COMPARED)}; got {', '.join(unknown) or 'too few'}")
+        require_each_once(methods=self.methods, seeds=self.seeds)
 
 
 def compare(bench: Bench, plan: ComparisonPlan | None = None) -> list[dict[str, Any]]:

@@ -96,6 +96,17 @@ class MeasuredRun:
     images: Path | None
 
 
+def require_each_once(**given: Sequence[Any]) -> None:
+    """Refuse lists of settings with repetitions: a run that is counted twice makes a spread of seeds too small.
+
+    Raises:
+        ValueError: If something is in its list twice.
+    """
+    for name, values in given.items():
+        if twice := [value for value in dict.fromkeys(values) if list(values).count(value) > 1]:
+            raise ValueError(f"{name} are given once each; got {', '.join(map(str, twice))} more than once")
+
+
 class Bench:
     """A capture with its Gaussians and features, on which languages are made and measured.
 

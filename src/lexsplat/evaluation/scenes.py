@@ -19,8 +19,9 @@ from lexsplat.evaluation.report.tables import table_rows, write_rows
 from lexsplat.evaluation.results import Metrics
 from lexsplat.pipeline.inputs import reload_capture
 from lexsplat.runtime.environment import machine_facts
-from lexsplat.runtime.errors import CaptureError
+from lexsplat.runtime.errors import CaptureError, SceneFolderError
 from lexsplat.runtime.files import atomic_path, read_json, require_writable, write_json
+from lexsplat.runtime.fingerprints import file_hash
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.facts import is_of_chosen_views
@@ -59,7 +60,7 @@ def evaluate_scene(
         The content of ``metrics.json``.
 
     Raises:
-        SceneFolderError: If the photos are missing, or the scene is the bundled one or being rebuilt.
+        SceneFolderError: If the photos are missing or are others, or the scene is the bundled one or being rebuilt.
         CaptureError: If a photo or a mask cannot be used, or ``masks`` or ``prompt_list`` is given and no held-out
             view has ground truth.
         OSError: If the folder takes no file.
@@ -71,6 +72,7 @@ def evaluate_scene(
     folder.refuse_bundled()
     require_writable(folder.root)
     photos = reload_capture(folder, capture)
+    _refuse_other_photos(folder, photos)
     _warn_of_limits(folder, photos)
     source = GroundTruthSource(masks, prompt_list)
     found = load_annotations(photos) if source == GroundTruthSource() else read_held_out(photos, source)
@@ -104,6 +106,23 @@ def evaluate_scene(
     _write_results(folder.root, metrics, gallery, title)
     listener(Event("report", len(gallery.views), len(gallery.views)))
     return metrics.to_json()
+
+
+def _refuse_other_photos(folder: SceneFolder, photos: Capture) -> None:
+    """Refuse held-out photos that are not those of the build: a folder of another place, or replaced files."""
+    built_from = folder.record.get("provenance", {}).get("sources", {})
+    other = [
+        name
+        for name in photos.test_names
+        if name in built_from and file_hash(photos.views[name].image_path) != built_from[name]
+    ]
+    if other:
+        raise SceneFolderError(
+            photos.root,
+            expected="the photos that the scene was built from",
+            found=f"{len(other)} of {len(photos.test_names)} held-out photos changed, such as {min(other)}",
+            remedy="give their folder with --capture, or build again",
+        )
 
 
 def _warn_of_limits(folder: SceneFolder, photos: Capture) -> None:
