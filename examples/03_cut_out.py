@@ -1,13 +1,13 @@
 """Select a thing by words, measure it, and save it as a splat file.
 
-python examples/03_cut_out.py [SCENE [PHRASE [OUTPUT.ply]]]
+python examples/03_cut_out.py [SCENE [PHRASE [OUTPUT]]]    the ending of OUTPUT is its format: .ply, .spz, .glb, ...
 """
 
 import sys
 from pathlib import Path
 
 import lexsplat
-from lexsplat.scenes.formats.ply import write_ply
+from lexsplat.scenes.exporting import export_gaussians
 
 folder = sys.argv[1] if len(sys.argv) > 1 else "demo"
 phrase = sys.argv[2] if len(sys.argv) > 2 else "red apple"
@@ -23,5 +23,5 @@ for thing in found.instances:
     print(f"{phrase}: {len(thing)} Gaussians around {center}, size {size} in units of the scene")
 
 output.parent.mkdir(parents=True, exist_ok=True)
-write_ply(found.selected, output)
+export_gaussians(found.selected, output, world=scene.world, overwrite=True)
 print(f"{len(found)} of {len(scene.gaussians)} Gaussians: {output}")

@@ -299,6 +299,15 @@ class TestImages:
         np.testing.assert_array_equal(views["a.png"].load_valid(), mask[::2, ::2] > 0)
         assert views["z.png"].load_valid() is None
 
+    def test_masks_that_leave_nothing_are_told_and_refused_if_no_photo_is_left(self, tmp_path):
+        self.one(tmp_path)
+        save(tmp_path / "masks" / "a.png.png", np.zeros((HEIGHT, WIDTH)))
+        (warning,) = load_capture(tmp_path).warnings
+        assert "1 of 2 photos take no part, because their masks are black: a.png" in warning
+        assert "invert them" in warning
+        save(tmp_path / "masks" / "z.png.png", np.zeros((HEIGHT, WIDTH)))
+        fails(tmp_path, "masks with white pixels", "only black ones")
+
 
 class TestMasks:
     def capture(self, root, names, **masks):

@@ -338,6 +338,33 @@ def test_a_truncated_photo_is_refused_before_any_work(tmp_path):
     assert not (tmp_path / "output").exists()
 
 
+def test_all_photos_that_cannot_be_read_are_named_at_once(tmp_path):
+    three_photos(tmp_path / "photos")
+    for name in ("x.jpg", "y.jpg"):
+        (tmp_path / "photos" / name).write_bytes(b"no image")
+    with pytest.raises(CaptureError, match="2 that are not, the first: 8 bytes") as error:
+        prepare_photos(tmp_path / "photos", tmp_path / "output")
+    assert "x.jpg" in str(error.value)
+    assert "y.jpg" in str(error.value)
+
+
+def test_a_tiny_photo_is_no_damaged_one(tmp_path):
+    three_photos(tmp_path / "photos")
+    Image.new("RGB", (4, 4)).save(tmp_path / "photos" / "tiny.jpg")
+    assert "tiny.jpg" in prepare_photos(tmp_path / "photos", tmp_path / "output").names
+
+
+def test_images_of_formats_that_are_not_read_are_named(tmp_path):
+    three_photos(tmp_path / "photos")
+    Image.new("L", (8, 8)).save(tmp_path / "photos" / "moving.gif")
+    (note,) = prepare_photos(tmp_path / "photos", tmp_path / "output").notes
+    assert "moving.gif is left out: its format is not read; save as JPEG or PNG" in note
+    for path in (tmp_path / "photos").glob("*.jpg"):
+        path.unlink()
+    with pytest.raises(CaptureError, match=r"found 0; moving\.gif is left out"):
+        prepare_photos(tmp_path / "photos", tmp_path / "output")
+
+
 @pytest.mark.parametrize("name", [b"a\nb.jpg", b"a\\b.jpg", b"\xff\xfe.jpg", b"sub\x7f/a.jpg"])
 def test_names_that_camera_files_cannot_hold_are_refused_before_any_work(tmp_path, name):
     three_photos(tmp_path / "photos")

@@ -52,7 +52,16 @@ def test_wrong_usage_is_reported(arguments):
 
 
 @pytest.mark.parametrize(
-    "options", [["--http", "--host", "0.0.0.0"], ["--token", "short"], ["--port", "0"], ["--port", "70000"]]
+    "options",
+    [
+        ["--http", "--host", "0.0.0.0"],
+        ["--http", "--token", "short"],
+        ["--http", "--port", "0"],
+        ["--http", "--port", "70000"],
+        ["--port", "8000"],
+        ["--host", "0.0.0.0"],
+        ["--token", "0123456789abcdef"],
+    ],
 )
 def test_an_open_door_is_refused(options, capsys):
     with pytest.raises(SystemExit) as stop:

@@ -76,7 +76,10 @@ def test_the_journal_holds_the_motions_of_the_command_line(built, tmp_path, caps
     assert cli.main(["edit", str(copy), "duplicate", *thing, "--by", "0", "0", "1"]) == 0
     _, moved, copied = map(json.loads, (copy / "edits.jsonl").read_text().splitlines())
     assert moved["step"] == "move"
-    assert moved["translation"] == [0.5, 0.0, 0.25]
+    lift = np.array(moved["translation"]) - [0.5, 0.0, 0.25]
+    up = open_scene(copy, device="cpu").world.up.direction
+    assert lift @ up == pytest.approx(np.linalg.norm(lift)), "what stands on something stands there enlarged"
+    assert 0 < np.linalg.norm(lift) < 1
     assert moved["scale"] == 1.5
     turn = np.array(moved["rotation"])
     assert np.trace(turn) == pytest.approx(1)  # 1 + 2 cos 90 degrees

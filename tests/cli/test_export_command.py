@@ -8,6 +8,12 @@ from support.command_line import Terminal, fails_in_one_line
 from lexsplat import cli
 
 
+def test_a_page_that_would_be_a_folder_named_html_is_refused(tmp_path, capsys):
+    target = tmp_path / "page.html"
+    fails_in_one_line(capsys, ["publish", "demo", str(target)], "page.html", "--single-file")
+    assert not target.exists()
+
+
 def test_export_writes_the_standard_ply(built, tmp_path):
     assert cli.main(["export", str(built), str(tmp_path / "a.ply")]) == 0
     assert (tmp_path / "a.ply").read_bytes() == (built / "gaussians.ply").read_bytes()

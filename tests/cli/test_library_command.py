@@ -153,6 +153,30 @@ def test_a_lost_library_file_is_repaired_by_verify(rooms, capsys, text):
     assert "in 1 of 2" in run(capsys, "search", rooms, "mug")
 
 
+def test_a_scene_whose_folder_is_gone_is_marked_in_the_list(rooms, capsys):
+    (rooms / "office").rename(rooms / "study")
+    try:
+        assert cli.main(["library", "list", str(rooms / "library")]) == 0
+    finally:
+        (rooms / "study").rename(rooms / "office")
+    marked = [line for line in capsys.readouterr().out.splitlines() if line.endswith("no such folder")]
+    assert [line.split(":")[0] for line in marked] == ["office"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["list", "x", "--repair"], "--repair is for verify, not for list"),
+        (["verify", "x", "--confirm"], "--confirm is for search, not for verify"),
+        (["add", "x", "demo", "--thumbnails", "y"], "--thumbnails is for search, not for add"),
+    ],
+)
+def test_an_option_of_another_action_is_refused(arguments, told, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["library", *arguments])
+    assert told in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

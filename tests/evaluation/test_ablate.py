@@ -251,9 +251,11 @@ def test_missing_seeds_and_unknown_variants_are_refused_before_any_work(tiny_cap
     assert not (tmp_path / "a").exists()
 
 
-@pytest.mark.parametrize("plan", [{"seeds": (1, 1)}, {"variants": ("full", "full")}, {"forms": ("code",) * 2}])
+@pytest.mark.parametrize(
+    "plan", [{"seeds": (1, 1)}, {"variants": ("full", "full")}, {"forms": ("code",) * 2}]
+)
 def test_what_is_given_twice_is_refused_because_its_spread_would_be_none(plan):
-    with pytest.raises(ValueError, match="given once each; got .* more than once"):
+    with pytest.raises(ValueError, match=r"given once each; got .* more than once"):
         AblationPlan(**plan)
 
 

@@ -130,7 +130,7 @@ def test_unknown_methods_are_refused_before_any_work(tiny_capture, tmp_path):
 
 @pytest.mark.parametrize("plan", [{"seeds": (0, 1, 0)}, {"methods": ("averaged", "averaged")}])
 def test_what_is_given_twice_is_refused_because_its_spread_would_be_none(plan):
-    with pytest.raises(ValueError, match="given once each; got (0|averaged) more than once"):
+    with pytest.raises(ValueError, match=r"given once each; got (0|averaged) more than once"):
         ComparisonPlan(**plan)
 
 

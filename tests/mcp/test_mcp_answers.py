@@ -79,5 +79,5 @@ def test_yes_perhaps_and_no_begin_a_sentence_that_reads_well(server):
     assert perhaps.count("Perhaps") == 1 or perhaps.startswith("No: nothing fits")
 
 
-def test_one_scene_is_not_called_one_scenes(server):
-    assert ask(server, "list_scenes")[1] == "1 scene: demo."
+def test_one_scene_is_not_called_one_scenes():
+    assert ask(make_server(open_scenes(["demo"])), "list_scenes")[1] == "1 scene: demo."

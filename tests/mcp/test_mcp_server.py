@@ -245,6 +245,23 @@ def test_resources_and_prompts_are_offered(server):
 
 
 @pytest.mark.slow
+def test_the_result_of_an_edit_can_be_asked_at_once(scenes, tmp_path):
+    server = make_server(scenes, tmp_path)
+    reply, text = ask(server, "edit", action="delete", phrase="toy car", folder="demo")
+    assert not reply.is_error
+    assert (reply.structured_content["name"], "the scene demo-2 in" in text) == ("demo-2", True)
+    assert (
+        ask(server, "find", phrase="toy car", scene="demo-2")[0].structured_content["phrases"][0]["present"]
+        == "no"
+    )
+    assert ask(server, "find", phrase="toy car")[0].structured_content["phrases"][0]["present"] == "yes"
+    reply, text = ask(server, "edit", action="delete", phrase="mug", folder="other", color=[0, 0, 1])
+    assert reply.is_error
+    assert "color: expected none, found one for delete" in text
+    assert list(scenes) == ["demo"], "other servers are not changed"
+
+
+@pytest.mark.slow
 def test_tools_that_write_are_offered_on_demand_and_write_new_files_in_one_folder_alone(scenes, tmp_path):
     server = make_server(scenes, tmp_path / "output")
     reply, _ = ask(server, "export", phrase="rubber duck", file="duck.ply")
@@ -306,7 +323,9 @@ def test_elsewhere_a_token_is_needed(scenes):
     for url in served(http_app(server, "0.0.0.0", TOKEN)):
         for given in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": TOKEN}):
             assert httpx2.post(url, headers=given, content="{}").status_code == 401
-        assert httpx2.post(url, headers={"Authorization": f"Bearer {TOKEN}"}, content="{}").status_code != 401
+        for scheme in ("Bearer", "bearer"):  # names of schemes ignore case
+            given = {"Authorization": f"{scheme} {TOKEN}"}
+            assert httpx2.post(url, headers=given, content="{}").status_code != 401
 
 
 @pytest.mark.slow

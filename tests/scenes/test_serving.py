@@ -26,7 +26,12 @@ def served_demo():
 
 
 def test_a_name_that_a_library_has_is_given_to_no_other_scene():
-    assert list(open_scenes(["demo"], taken=["demo", "demo-2"])) == ["demo-3"]
+    assert list(open_scenes(["demo"], taken=dict.fromkeys(["demo", "demo-2"]))) == ["demo-3"]
+
+
+def test_a_folder_is_served_once():
+    assert list(open_scenes(["demo", str(BUNDLED_SCENE), "demo"])) == ["demo"]
+    assert list(open_scenes(["demo"], taken={"bundled": BUNDLED_SCENE})) == []
 
 
 def test_what_was_used_least_recently_is_forgotten():

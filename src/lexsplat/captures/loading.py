@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 
 from lexsplat.captures.capture import Capture, View, stem_of
 from lexsplat.captures.ground_truth.layouts import annotated_names
-from lexsplat.captures.images.masks import IGNORE_FOLDER, find_ignore_masks
+from lexsplat.captures.images.masks import IGNORE_FOLDER, blank_masks, find_ignore_masks
 from lexsplat.captures.images.reading import IMAGE_SUFFIXES, image_size, sizes_agree
 from lexsplat.captures.images.undistortion import pinhole_of
 from lexsplat.captures.readers.camera_files import CameraFiles, Photo
@@ -60,6 +60,7 @@ def load_capture(
         photo.name: _make_view(photo, files, downscale, masked.get(photo.name))
         for photo in sorted(files.photos, key=lambda photo: photo.name)
     }
+    warnings += _blank(views, files.root)
     _check_names([photo.name for photo in files.photos], files.origin)
     root = files.root if beside is None else Path(beside)
     chosen, split_warnings = choose_test_names(
@@ -83,6 +84,23 @@ def load_capture(
         warnings=tuple(warnings),
         background=files.background,
     )
+
+
+def _blank(views: Mapping[str, View], root: Path) -> list[str]:
+    """A warning that counts the photos of which a mask leaves nothing, if there are any.
+
+    Raises:
+        CaptureError: If no other photo is left.
+    """
+    blank = blank_masks({name: view.ignore_path for name, view in views.items() if view.ignore_path})
+    remedy = "black is ignored and white is used: if the masks are the wrong way round, invert them"
+    if blank and len(blank) == len(views):
+        raise CaptureError(root, expected="masks with white pixels", found="only black ones", remedy=remedy)
+    if not blank:
+        return []
+    some = ", ".join(blank[:3]) + (" and more" if len(blank) > 3 else "")
+    told = f"{len(blank)} of {len(views)} photos take no part, because their masks are black: {some}"
+    return [f"{root}: {told}; {remedy}"]
 
 
 def _missing_files(files: CameraFiles) -> list[str]:

@@ -54,7 +54,7 @@ class Ask:
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
         served = OpenScene(self.scene, self.device, self.clip, LateProgress())
         for phrase in self.phrases:
-            print(sentence(find_phrase(served.scene, phrase), served.scene.world.meters_per_unit))
+            print(sentence(find_phrase(served.scene, phrase)))
         if not self.stdin:
             return
         served.warm()

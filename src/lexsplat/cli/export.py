@@ -24,9 +24,9 @@ from lexsplat.runtime.progress import uncounted
 class Export:
     """Write a scene, or what was found in it, for other programs. The ending of the file name selects the format.
 
-    .ply (the standard of 3D Gaussian Splatting), .spz (version 4; .v3.spz is version 3), .sog (the smallest), .glb
-    (glTF with KHR_gaussian_splatting), .splat, .points.ply (a plain point cloud); .compressed.ply and .ksplat with
-    pip install "lexsplat[formats]"; .csv and .json for labels (see docs/formats.md).
+    .ply (the standard of 3D Gaussian Splatting), .spz (version 4; .v3.spz is version 3), .sog (compressed images),
+    .glb (glTF with KHR_gaussian_splatting), .splat, .points.ply (a plain point cloud); .compressed.ply and .ksplat
+    with pip install "lexsplat[formats]"; .csv and .json for labels (see docs/formats.md).
 
     Args:
         scene: A scene folder, or the word "demo" for the bundled scene.

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 log = logging.getLogger("lexsplat")
 
 _REQUIRED = "(required)"
+_FOR = {"repair": ("verify",), "confirm": ("search",), "thumbnails": ("search",)}
+"""Options that belong to some actions only."""
 Action = tyro.conf.Positional[
     Annotated[
         Literal["add", "search", "list", "remove", "verify"], tyro.conf.arg(help_behavior_hint=_REQUIRED)
@@ -80,6 +82,9 @@ class LibraryCommand:
             raise ValueError("at least one SCENE is needed")
         if self.action in ("list", "verify") and self.words:
             raise ValueError(f"{self.action} takes no SCENE, got {self.words[0]}")
+        for option, actions in _FOR.items():
+            if getattr(self, option) not in (False, None) and self.action not in actions:
+                raise ValueError(f"--{option} is for {' and '.join(actions)}, not for {self.action}")
         if self.limit < 1:
             raise ValueError(f"limit must be at least 1, got {self.limit}")
 
@@ -143,8 +148,10 @@ class LibraryCommand:
         from lexsplat.scenes.serving import counted
 
         records = library.records()
+        gone = {record.name for record in records if not (library.folder(record) / "scene.json").is_file()}
         for record in records:
-            self._say(f"{record.name}: {record.path}, {record.gaussians:,} Gaussians, encoder {record.clip}")
+            told = f"{record.path}, {record.gaussians:,} Gaussians, encoder {record.clip}"
+            self._say(f"{record.name}: {told}{', no such folder' if record.name in gone else ''}")
         problems = {**orphans(library), **{name: str(error) for name, error in library.damaged.items()}}
         for problem in problems.values():
             self._say(f"damaged: {problem}")
@@ -158,7 +165,7 @@ class LibraryCommand:
 
         problems = library.verify(self.repair)
         for name, problem in problems.items():
-            self._say(f"{name}: {problem}")
+            self._say(problem if problem.startswith(f"{name}: ") else f"{name}: {problem}")
         if not problems:
             count = len(library.names())
             self._say(f"{counted(count, 'scene')} {'is' if count == 1 else 'are'} sound")

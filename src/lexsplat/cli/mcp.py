@@ -63,6 +63,12 @@ class Mcp:
         """Refuse invalid options."""
         if not self.scenes:
             raise ValueError("at least one SCENE is needed, such as demo")
+        defaults = {field.name: field.default for field in dataclasses.fields(self)}
+        given = [name for name in ("host", "port", "token") if getattr(self, name) != defaults[name]]
+        if given and not self.http:
+            raise ValueError(
+                f"--{given[0]} needs --http: without it, clients talk over standard input and output"
+            )
         if not 0 < self.port < 65536:
             raise ValueError(f"port must be in 1..65535, got {self.port}")
         if self.token is not None and len(self.token) < 16:
@@ -124,5 +130,8 @@ class Mcp:
                 library = open_library(libraries[0], device=self.device)
             library.listener = listener
         alone = [path for path in self.scenes if path not in libraries]
-        taken = library.names() if library is not None else ()
+        taken: dict[str, Path | None] = {}
+        if library is not None:
+            taken.update(dict.fromkeys(library.names()))
+            taken.update({record.name: library.folder(record).resolve() for record in library.records()})
         return open_scenes(alone, self.device, self.clip, listener, taken), library

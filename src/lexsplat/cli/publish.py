@@ -11,6 +11,7 @@ import tyro
 
 from lexsplat.cli.options import Device, SceneArgument, open_scene
 from lexsplat.cli.waiting import starting
+from lexsplat.runtime.errors import SceneFolderError
 
 FolderArgument = tyro.conf.Positional[
     Annotated[Path, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(required)")]
@@ -65,6 +66,17 @@ class Publish:
         with starting():
             from lexsplat.scenes.publishing import PublishOptions, check_target, publish
 
+        if (
+            not self.single_file
+            and self.folder.suffix.lower() in (".html", ".htm")
+            and not self.folder.is_dir()
+        ):
+            raise SceneFolderError(
+                self.folder,
+                expected="a folder",
+                found="the name of a page",
+                remedy="give --single-file as well",
+            )
         check_target(self.folder, self.single_file)  # before anything is loaded
         options = PublishOptions(
             self.title,

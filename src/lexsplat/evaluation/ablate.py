@@ -96,9 +96,7 @@ class AblationPlan:
         if not self.seeds or not self.forms or not self.methods:
             raise ValueError("an ablation needs at least one seed, one form and one method")
         with_wrong_labels({}, self.wrong_labels, 1, 0)  # refuses an invalid share
-        require_each_once(
-            methods=self.methods, variants=self.variants, forms=self.forms, seeds=self.seeds
-        )
+        require_each_once(methods=self.methods, variants=self.variants, forms=self.forms, seeds=self.seeds)
         unknown = [name for name in self.methods if name not in METHODS]
         if unknown:
             raise ValueError(f"methods are {', '.join(METHODS)}; got {', '.join(unknown)}")

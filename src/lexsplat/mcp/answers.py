@@ -292,6 +292,7 @@ class ExportAnswer(World, Asked):
 class EditAnswer(World, Asked):
     """The scene that was written."""
 
-    scene: str
+    scene: Annotated[str, Field(description="Its folder.")]
+    name: Annotated[str, Field(description="The name by which this server serves it.")]
     action: str
     gaussians: Count

@@ -56,6 +56,7 @@ def make_server(
     """
     server = _Server("lexsplat", version=__version__, instructions=INSTRUCTIONS, log_level="WARNING")
     logging.getLogger("mcp").setLevel(logging.ERROR)
+    scenes = dict(scenes)  # an edit adds another one
     tools = Tools(scenes) if library is None else LibraryTools(scenes, library)
     reading = ToolAnnotations(read_only_hint=True, open_world_hint=False)
     for name in _public(type(tools)):
@@ -180,11 +181,12 @@ def http_app(server: MCPServer, host: str, token: str | None) -> Callable[..., A
 
 def _with_token(app: Callable[..., Any], token: str) -> Callable[..., Any]:
     """The application for those who send ``Authorization: Bearer TOKEN``."""
-    wanted = f"Bearer {token}".encode()
+    wanted = token.encode()
 
     async def checked(scope: Any, receive: Any, send: Any) -> None:
-        given = dict(scope.get("headers", [])).get(b"authorization", b"")
-        if scope["type"] == "http" and not hmac.compare_digest(given, wanted):
+        scheme, _, given = dict(scope.get("headers", [])).get(b"authorization", b"").partition(b" ")
+        allowed = scheme.lower() == b"bearer" and hmac.compare_digest(given.strip(), wanted)
+        if scope["type"] == "http" and not allowed:
             await send(
                 {"type": "http.response.start", "status": 401, "headers": [(b"www-authenticate", b"Bearer")]}
             )

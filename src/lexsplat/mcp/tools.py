@@ -62,6 +62,7 @@ class Tools:
 
     def __init__(self, scenes: Mapping[str, OpenScene], library: Library | None = None) -> None:
         self.scenes, self.library = scenes, library
+        self._only = next(iter(scenes)) if len(scenes) == 1 else ""  # also after an edit has made another one
 
     def list_scenes(self) -> Annotated[Reply, answers.ScenesAnswer]:
         """List the places that can be searched."""
@@ -120,7 +121,7 @@ class Tools:
         """Find things by words: where they are, how large, how many, best view; "present": "no" means not here."""
         place = self._scene(scene)
         document = find_phrases(place, phrase, view or None, threshold)
-        return Reply(sentence(document["phrases"][0], place.world.meters_per_unit), document)
+        return Reply(sentence(document["phrases"][0]), document)
 
     def count(self, phrase: PhraseText, scene: SceneName = "") -> Annotated[Reply, answers.Counted]:
         """Count things by words, such as "apples" or "toys on the table"."""
@@ -161,7 +162,7 @@ class Tools:
             "holds": holds.lower(),
             "seen_from": found.seen_from or None,
         }
-        text = sentence(answer, place.world.meters_per_unit)
+        text = sentence(answer)
         if found.present == "no":
             text = text.replace("Not here", "No", 1)
         elif found.present == "yes":
@@ -272,7 +273,7 @@ class Tools:
             "thing": best.geometry() if name else None,
         }
         named = {**shown.geometry(), "name": name or "something without a known name"}
-        there = placed(named, place.world.meters_per_unit, " is there, at ")
+        there = placed(named, " is there, at ")
         return Reply(qualified(f"{there}.", document), document)
 
     def render(
@@ -312,17 +313,16 @@ class Tools:
         return Reply(" ".join((text, *heat)), document, png)
 
     def _scene(self, name: str) -> Scene:
-        if not name and len(self.scenes) == 1:
-            return next(iter(self.scenes.values())).scene
+        name = name or self._only
         if name not in self.scenes:
             kept = self.library.names() if self.library is not None else []
             known = [*self.scenes, *kept]
             if self.library is not None and (name in kept or (not name and len(known) == 1)):
                 return self.library.scene(name or known[0])
             raise QueryError(
-                f"scene {name[:60]!r}",
+                f"scene {name[:60]!r}" if name else "scene",
                 expected=f"one of {', '.join(known)[:200]}",
-                found="no such name",
+                found="no such name" if name else "none",
                 remedy=nearest(name, known, "list_scenes has the names"),
             )
         return self.scenes[name].scene

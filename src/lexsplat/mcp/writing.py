@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, MutableMapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,7 +17,7 @@ from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.exporting import ending_of, export_scene, exported
 from lexsplat.scenes.library import Library
-from lexsplat.scenes.serving import OpenScene, counted, qualified, sentence, shortened
+from lexsplat.scenes.serving import OpenScene, counted, new_name, qualified, sentence, shortened
 
 FileName = Annotated[str, Field(description='Name of a new file without a folder, such as "duck.ply".')]
 
@@ -26,14 +26,16 @@ class WritingTools(Tools):
     """The tools that write.
 
     Args:
-        scenes: The served scenes by name.
+        scenes: The served scenes by name; edited ones are added.
         output: The folder of all files; nothing is written elsewhere.
         library: A library whose scenes are served as well.
     """
 
-    def __init__(self, scenes: Mapping[str, OpenScene], output: Path, library: Library | None = None) -> None:
+    def __init__(
+        self, scenes: MutableMapping[str, OpenScene], output: Path, library: Library | None = None
+    ) -> None:
         super().__init__(scenes, library)
-        self.output = output
+        self._served, self.output = scenes, output
 
     def export(
         self, phrase: PhraseText, file: FileName, scene: SceneName = ""
@@ -64,8 +66,13 @@ class WritingTools(Tools):
             ),
         ] = False,
     ) -> Annotated[Reply, answers.EditAnswer]:
-        """Make a new scene without a thing, with it alone or in another color; "unsure" needs confirm=true."""
+        """Make a new scene without a thing, with it alone or in another color, and serve it, too.
+
+        What is "unsure" needs confirm=true.
+        """
         place, path = self._scene(scene), self._new("folder", folder)
+        if action != "recolor" and color:
+            raise QueryError("color", expected="none", found=f"one for {action}", remedy="leave it out")
         if action == "recolor" and not (len(color) == 3 and all(0 <= value <= 1 for value in color)):
             raise QueryError(
                 "color",
@@ -78,7 +85,7 @@ class WritingTools(Tools):
             raise QueryError(
                 phrase[:60],
                 expected="something that the scene holds for certain",
-                found=sentence({**found.to_dict(), **asked}, place.world.meters_per_unit).rstrip("."),
+                found=sentence({**found.to_dict(), **asked}).rstrip("."),
                 remedy="look at it with render, then edit with confirm=true, or name it in other words",
             )
         editor = Editor(place)
@@ -89,15 +96,21 @@ class WritingTools(Tools):
         count = int(editor.steps[-1].mask.sum())
         with _writing(path):
             saved = editor.save(path)
+        kept = self.library.names() if self.library is not None else []
+        name = new_name(folder, {*self._served, *kept})
+        self._served[name] = OpenScene(saved.root, place.gaussians.device.type, place.clip)
         document = {
             **place.world.to_json(),
             **asked,
             "scene": str(saved.root),
+            "name": name,
             "action": action,
             "gaussians": count,
         }
         what = f"{shortened(asked['understood'])}{' (unsure)' if asked['present'] == 'unsure' else ''}"
-        text = f"{action} {what}: {counted(count, 'Gaussian')}; the result is the scene {saved.root}."
+        text = (
+            f"{action} {what}: {counted(count, 'Gaussian')}; the result is the scene {name} in {saved.root}."
+        )
         return Reply(text + (f" Note: {asked['note']}." if asked["note"] else ""), document)
 
     def _new(self, argument: str, name: str) -> Path:

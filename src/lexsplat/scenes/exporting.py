@@ -37,12 +37,13 @@ LABEL_ENDINGS = (".csv", ".json")
 """Formats of labels."""
 
 
-def ending_of(path: Path) -> str:
+def ending_of(path: str | Path) -> str:
     """The known ending of a file name, which selects the format.
 
     Raises:
         SceneFolderError: If it has none.
     """
+    path = Path(path)
     name = path.name.lower()
     for ending in (*SPLAT_ENDINGS, *LABEL_ENDINGS):
         if name.endswith(ending):
@@ -56,7 +57,7 @@ def ending_of(path: Path) -> str:
 
 def export_gaussians(
     gaussians: Gaussians,
-    path: Path,
+    path: str | Path,
     *,
     language: StoredLanguage | None = None,
     world: World | None = None,
@@ -80,7 +81,7 @@ def export_gaussians(
         QueryError: If there are no Gaussians.
         BackendError: If the format needs a library that is not installed.
     """
-    ending = ending_of(path)
+    path, ending = Path(path), ending_of(path)
     _check_language_fits(path, language is not None)
     if len(gaussians) == 0:
         raise QueryError(path, expected="something to write", found="no Gaussian")
@@ -118,7 +119,7 @@ def export_gaussians(
 
 def export_scene(
     scene: Scene,
-    path: Path,
+    path: str | Path,
     *,
     found: Sequence[Selection] = (),
     language: bool = False,
@@ -141,7 +142,7 @@ def export_scene(
         QueryError: If nothing is selected.
         SceneFolderError: See `export_gaussians`; also for labels without selections.
     """
-    ending = ending_of(path)
+    path, ending = Path(path), ending_of(path)
     _check_language_fits(path, language)
     if scene.folder is not None:
         scene.folder.refuse_own_file(path)

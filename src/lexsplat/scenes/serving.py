@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import logging
 import re
@@ -94,17 +95,35 @@ def open_scenes(
     device: str = "auto",
     clip: str | None = None,
     listener: Listener = silent,
-    taken: Container[str] = (),
+    taken: Mapping[str, Path | None] | None = None,
 ) -> dict[str, OpenScene]:
-    """Several scenes by the names of their folders; a number is added to one that occurs twice or is ``taken``."""
+    """Several scenes by the names of their folders, each folder once.
+
+    Args:
+        paths: The folders.
+        device: "auto", "cpu" or "cuda".
+        clip: Text encoder, if it is not where the builds found it.
+        listener: Receives progress events of the scenes.
+        taken: Names that are in use, and the folders that need no other name. A number is added to another scene's.
+
+    Raises:
+        SceneFolderError: If one of them is no finished scene.
+    """
+    known = {} if taken is None else dict(taken)
     found: dict[str, OpenScene] = {}
     for path in paths:
-        base = name = Path(path).resolve().name if path != "demo" else path
-        number = 2
-        while name in found or name in taken:
-            name, number = f"{base}-{number}", number + 1
-        found[name] = OpenScene(path, device, clip, listener)
+        root = SceneFolder.open(Path(path)).root.resolve()
+        if root not in known.values():
+            name = new_name("demo" if path == "demo" else root.name, known)
+            known[name] = root
+            found[name] = OpenScene(path, device, clip, listener)
     return found
+
+
+def new_name(base: str, taken: Container[str]) -> str:
+    """A name, with a number where it is taken."""
+    names = itertools.chain([base], (f"{base}-{number}" for number in itertools.count(2)))
+    return next(name for name in names if name not in taken)
 
 
 def error_document(error: LexsplatError) -> dict[str, Any]:
@@ -113,7 +132,7 @@ def error_document(error: LexsplatError) -> dict[str, Any]:
     return {"error": {"message": str(error), **parts}}
 
 
-def sentence(answer: Mapping[str, Any], meters_per_unit: float | None = None) -> str:
+def sentence(answer: Mapping[str, Any]) -> str:
     """An answer of `find_phrase` in one plain sentence."""
     understood = shortened(answer["understood"])
     if answer["present"] == "no":
@@ -121,7 +140,7 @@ def sentence(answer: Mapping[str, Any], meters_per_unit: float | None = None) ->
     elif not answer["instances"]:
         text = f"None found for {understood}."  # the note says why
     else:
-        things = "; ".join(placed(thing, meters_per_unit) for thing in answer["instances"][:8])
+        things = "; ".join(placed(thing) for thing in answer["instances"][:8])
         more = f"; and {answer['count'] - 8} more" if answer["count"] > 8 else ""
         text = f"{answer['count']} found for {understood}: {things}{more}."
         return qualified(text, answer)
@@ -134,11 +153,10 @@ def qualified(text: str, answer: Mapping[str, Any]) -> str:
     return f"{text} Note: {answer['note']}." if answer.get("note") else text
 
 
-def placed(thing: Mapping[str, Any], meters_per_unit: float | None, link: str = " at ") -> str:
-    """A thing (`Selection.geometry`) with its place and best view, for a sentence."""
-    scale, unit = (meters_per_unit, "m") if meters_per_unit else (1.0, "scene units")
-    center = ", ".join(f"{value * scale:.2f}" for value in thing["center"])
-    return f"{shortened(thing['name'], 60)}{link}({center}) {unit}, {seen_in(thing)}"
+def placed(thing: Mapping[str, Any], link: str = " at ") -> str:
+    """A thing (`Selection.geometry`) with its place and best view, for a sentence; places are in scene units."""
+    center = ", ".join(f"{value:.2f}" for value in thing["center"])
+    return f"{shortened(thing['name'], 60)}{link}({center}) scene units, {seen_in(thing)}"
 
 
 def seen_in(thing: Mapping[str, Any]) -> str:
@@ -184,7 +202,7 @@ def answer_line(served: OpenScene, line: str) -> dict[str, Any]:
         _check(request)
         scene = served.scene
         answer = find_phrase(scene, request["ask"], request.get("view"), request.get("threshold"))
-        return {**identity, **answer, "sentence": sentence(answer, scene.world.meters_per_unit)}
+        return {**identity, **answer, "sentence": sentence(answer)}
     except LexsplatError as error:
         return {**identity, **error_document(error)}
     except Exception as error:  # the next line is answered, whatever this one meets

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from lexsplat.captures.capture import stem_of
-from lexsplat.captures.images.reading import IMAGE_SUFFIXES
+from lexsplat.captures.images.reading import IMAGE_SUFFIXES, open_image
 
+_PACKED, _SMALL = 64, 1 << 20
+"""A file with fewer pixels to a byte, beyond so many pixels, holds more than one color."""
 IGNORE_FOLDER = "masks"
 """Folder of a capture with ``NAME.png`` (COLMAP's convention: ``0001.jpg.png``) or ``STEM.png``. Pixels of value 0
 are ignored by feature extraction, matching and losses."""
@@ -41,4 +43,23 @@ def find_ignore_masks(folders: Sequence[Path], names: Iterable[str]) -> tuple[di
     if not strays:
         return found, []
     some = ", ".join(strays[:3]) + (" and more" if len(strays) > 3 else "")
-    return found, [f"{folder}: {len(strays)} masks match no photo and are ignored: {some}"]
+    many = "1 mask matches" if len(strays) == 1 else f"{len(strays)} masks match"
+    return found, [f"{folder}: {many} no photo and {'is' if len(strays) == 1 else 'are'} ignored: {some}"]
+
+
+def blank_masks(masks: Mapping[str, Path]) -> list[str]:
+    """The photos whose mask is black throughout, so that they take no part: masks the wrong way round, for example.
+
+    Args:
+        masks: Mask files by photo name.
+    """
+    return [name for name, path in masks.items() if _is_black(path)]
+
+
+def _is_black(path: Path) -> bool:
+    """Whether an image is black throughout. Large files are not: one color takes a thousandth of its pixels."""
+    with open_image(path) as image:
+        if path.stat().st_size * _PACKED > image.width * image.height + _SMALL:
+            return False
+        extrema = image.convert("L").getextrema()
+    return float(extrema[1]) == 0  # type: ignore[arg-type]

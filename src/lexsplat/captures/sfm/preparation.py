@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,12 @@ _FOCAL = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210)
 """EXIF tags of the focal length: in millimeters, as 35 mm equivalent, and sensor pixels per unit."""
 _APART = (IGNORE_FOLDER, "segmentations")
 _JPEG_QUALITY = 95
+_NOT_READ = (
+    ".gif", ".avif", ".jxl", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".raw", ".psd",
+    ".svg", ".exr", ".hdr",
+)  # fmt: skip
+"""Endings of image files that are not read; cameras write some of them beside their JPEGs."""
+_Found = TypeVar("_Found")
 
 
 @dataclass(frozen=True)
@@ -130,11 +136,11 @@ def prepare_photos(
         MemoryBudgetError: If a photo is too large for ``memory``.
     """
     names = checked_photos(folder, output)
-    largest = max((image_size(folder / name) for name in names), key=lambda size: size[0] * size[1])
+    largest = max(_of_all(names, lambda name: image_size(folder / name)), key=lambda size: size[0] * size[1])
     budget.check_photo(largest, memory)
-    photos = [_look_at(folder, name) for name in names]
+    photos = _of_all(names, lambda name: _look_at(folder, name))
     largest = max((photo.size for photo in photos), key=lambda size: size[0] * size[1])
-    notes: list[str] = []
+    notes = _other_images(folder)
     found, strays = find_ignore_masks(mask_places(folder), names)
     notes += strays
     images, renamed = folder, {name: name for name in names}
@@ -147,7 +153,8 @@ def prepare_photos(
         _copy_photos(photos, folder, images, renamed, listener)
         turned = sum(photo.orientation != 1 for photo in photos)
         converted = sum(not photo.plain for photo in photos)
-        notes.append(f"{turned} photos rotated upright and {converted} converted to JPEG or PNG in {images}")
+        done = f"rotated upright: {turned}; converted to JPEG or PNG: {converted}"
+        notes.append(f"copies of photos are in {images}: {done}")
     masks = None
     if found:
         masks = _write_masks(photos, found, renamed, output)
@@ -157,6 +164,39 @@ def prepare_photos(
         groups.setdefault((photo.size, photo.focal), []).append(renamed[photo.name])
     lenses = tuple(tuple(sorted(group)) for group in groups.values())
     return PreparedPhotos(images, tuple(sorted(renamed.values())), lenses, masks, largest, tuple(notes))
+
+
+def _of_all(names: Sequence[str], look: Callable[[str], _Found]) -> list[_Found]:
+    """What is found at each photo; all that cannot be read are named at once."""
+    found, broken = [], list[CaptureError]()
+    for name in names:
+        try:
+            found.append(look(name))
+        except CaptureError as error:
+            broken.append(error)
+    if len(broken) == 1:
+        raise broken[0]
+    if broken:
+        some = ", ".join(str(error.subject) for error in broken[:3]) + (
+            " and more" if len(broken) > 3 else ""
+        )
+        raise CaptureError(
+            some,
+            expected=broken[0].expected,
+            found=f"{len(broken)} that are not, the first: {broken[0].found}",
+            remedy="replace them, or remove them from the capture",
+        )
+    return found
+
+
+def _other_images(folder: Path) -> list[str]:
+    """A note on image files of formats that are not read, if there are any."""
+    other = sorted(
+        path.name for path in folder.iterdir() if path.suffix.lower() in _NOT_READ and path.is_file()
+    )
+    some = ", ".join(other[:3]) + (" and more" if len(other) > 3 else "")
+    told = "is left out: its format is" if len(other) == 1 else "are left out: their formats are"
+    return [f"{folder}: {some} {told} not read; save as JPEG or PNG"] if other else []
 
 
 def checked_photos(folder: Path, output: Path) -> list[str]:
@@ -177,7 +217,7 @@ def checked_photos(folder: Path, output: Path) -> list[str]:
         raise CaptureError(
             folder,
             expected="at least 3 photos",
-            found=str(len(names)),
+            found="; ".join([str(len(names)), *(note.partition(": ")[2] for note in _other_images(folder))]),
             remedy="take 30 or more photos around the place",
         )
     for name in names:
@@ -224,7 +264,7 @@ def _look_at(folder: Path, name: str) -> _Photo:
         if plain:
             # Decoding at an eighth of the size finds truncated files now, in 50 ms for 12 megapixels. The other
             # photos are decoded in full when they are converted.
-            image.draft("RGB", (width // 8, height // 8))
+            image.draft("RGB", (max(1, width // 8), max(1, height // 8)))
             image.load()
     orientation = exif.get(_ORIENTATION, 1)
     if orientation not in range(1, 9):

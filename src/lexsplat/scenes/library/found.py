@@ -56,7 +56,7 @@ class Hit:
 
     def without_note(self) -> str:
         """The answer as text without the note, which is part of the library's answer."""
-        text = sentence({**self.answer, "note": ""}, self.world.meters_per_unit)
+        text = sentence({**self.answer, "note": ""})
         return f"{self.scene}: present: {self.present}. {text}{self._sizes()}"
 
     def _sizes(self) -> str:
@@ -89,7 +89,7 @@ class Hit:
     @property
     def sentence(self) -> str:
         """The answer in one plain sentence."""
-        return sentence(self.answer, self.world.meters_per_unit)
+        return sentence(self.answer)
 
     def picture(self, side: int = 320) -> Image.Image:
         """The view that shows the first thing best, with a frame around it; the longer side in pixels.

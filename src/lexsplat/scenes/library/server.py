@@ -21,6 +21,7 @@ from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import torch
@@ -268,7 +269,10 @@ class Server:
             found = f"status {answer.status_code} {answer.text[:160]}".strip()
         except absent:
             found = "no connection"
-            remedy = "start it (chroma run --path FOLDER), or leave --index out to compare with all scenes"
+            port = f" --port {number}" if (number := urlsplit(self.url).port) else ""
+            remedy = (
+                f"start it (chroma run --path FOLDER{port}), or leave --index out to compare with all scenes"
+            )
         except late:
             found = f"no answer within {ANSWER_SECONDS:.0f} seconds"
         except (other, ValueError) as error:
