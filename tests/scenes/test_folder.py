@@ -95,3 +95,16 @@ def test_a_build_removes_only_temporary_files_of_dead_processes(tmp_path):
         assert being_written.exists()
     assert not left.exists()
     assert others.exists()
+
+
+def test_a_working_directory_with_other_files_is_no_output(tmp_path, monkeypatch):
+    """An empty name, as of a variable that is not set, means it."""
+    monkeypatch.chdir(tmp_path)
+    SceneFolder(Path("")).refuse_foreign_files()
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(SceneFolderError, match="the working directory .*; give --output a name"):
+        SceneFolder(Path("")).refuse_foreign_files()
+    (tmp_path / "scene.json").write_text("{}")
+    folder = SceneFolder(tmp_path / "elsewhere")
+    folder.root.mkdir()
+    folder.refuse_foreign_files()

@@ -177,7 +177,8 @@ class _Evaluation:
             if observer is not None:
                 automatic = {prompt: self.thresholds[prompt]["auto"] for prompt in ground_truth}
                 observer(ViewImages(view.name, photo, image, relevancy, ground_truth, automatic))
-            listener(Event("evaluate", done, len(self.views), {"psnr": scores["psnr"] or 0.0}))
+            so_far = mean_of([each["psnr"] for each in per_view.values()]) or 0.0
+            listener(Event("evaluate", done, len(self.views), {"psnr": so_far}))
         for prompt in self.prompts:
             curves = [prompts[prompt].counts.iou for prompts in self.pairs.values() if prompt in prompts]
             self.thresholds[prompt]["oracle"] = float(THRESHOLDS[np.argmax(np.mean(curves, axis=0))])

@@ -75,7 +75,14 @@ _OF_ITS_THING = re.compile(
     re.IGNORECASE,
 )
 """A part of a thing: "the nose of the bear" asks for the bear nose."""
+_HAS_PART = re.compile(
+    rf"^(?:does|do|has|have) (?:(?:the|an?|my|your|this|that) )?((?:[\w-]+ ){{0,2}}(?:{'|'.join(sorted(NAMES))})s?) "
+    rf"(?:have |got )(?:(?:got|an?|any|the|some) )*((?:{'|'.join(sorted(PARTS))})(?:e?s)?)$",
+    re.IGNORECASE,
+)
+"""Whether a thing has a part: "does the mug have a handle" asks for the mug handle."""
 _REWORDED = (
+    (_HAS_PART, r"\1 \2"),
     (_OF_ITS_THING, r"\2 \1"),
     (_NEGATIVE, r"\1 "),
     (re.compile(r"\b(everything|anything|nothing|all)( else)? besides\b", re.IGNORECASE), r"\1 except"),

@@ -200,10 +200,20 @@ class SceneFolder:
         """Refuse a folder in which a build would replace files of another program.
 
         Raises:
-            SceneFolderError: If it has such files but no ``scene.json``, the first file of a build.
+            SceneFolderError: If it has such files but no ``scene.json``, the first file of a build; or if it is the
+                working directory, which an empty name means, and has any file but that.
         """
+        if (self.root / "scene.json").exists():
+            return
+        if self.root.resolve() == Path.cwd() and any(path.name[0] != "." for path in self.root.iterdir()):
+            raise SceneFolderError(
+                "output",
+                expected="a new folder or one of an earlier build",
+                found=f"the working directory {self.root.resolve()}, which has other files",
+                remedy="give --output a name",
+            )
         there = [name for name in SCENE_FILES if (self.root / name).exists()]
-        if there and "scene.json" not in there:
+        if there:
             raise SceneFolderError(
                 self.root / there[0],
                 expected="a new folder or one of an earlier build",
