@@ -10,8 +10,8 @@
 lexsplat=${LEXSPLAT:-lexsplat}
 python=${PYTHON:-python3}
 scene=${1:-demo}
-command -v "$lexsplat" > /dev/null || { echo "$lexsplat: not found; set LEXSPLAT to its path" >&2; exit 1; }
-"$lexsplat" info "$scene" > /dev/null || exit 1
+command -v "${lexsplat%% *}" > /dev/null || { echo "$lexsplat: not found; set LEXSPLAT to its path" >&2; exit 1; }
+$lexsplat info "$scene" > /dev/null || exit 1
 [ $# -gt 0 ] && shift
 [ $# -gt 0 ] || set -- apple mug unicorn "thing left of the vase"
 
@@ -19,9 +19,9 @@ for thing in "$@"; do
     quoted=$(printf '%s' "$thing" | tr '\t\n' '  ' | sed 's/[\\"]/\\&/g')
     printf '{"ask": "%s", "id": "%s"}\n' "$quoted" "$quoted"
 done |
-    "$lexsplat" ask "$scene" --stdin |
+    $lexsplat ask "$scene" --stdin |
     while IFS= read -r line; do
-        printf '%s\n' "$line" | "$python" -c '
+        printf '%s\n' "$line" | $python -c '
 import json, sys
 answer = json.load(sys.stdin)
 if "error" in answer:
