@@ -42,7 +42,7 @@ def test_an_edit_is_undone_redone_and_saved_and_the_new_scene_answers(built, tin
     less = f"{int(rest.sum()):,} Gaussians"
     delete = ("delete", "--select", "blue ball", "--threshold", "0.05", "--no-fill")
     assert edit(*delete) == f"{less}, 0 steps undone"
-    assert edit("undo") == f"{everything}, 1 steps undone"
+    assert edit("undo") == f"{everything}, 1 step undone"
     assert edit("redo") == f"{less}, 0 steps undone"
     edit("save", "--output", str(saved))
     assert edit("discard", "--yes") == f"{everything}, 0 steps undone"

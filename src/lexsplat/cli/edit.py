@@ -145,6 +145,7 @@ class Edit:
             from lexsplat.scenes.editing import Editor
             from lexsplat.scenes.journal import journal_of
             from lexsplat.scenes.previous import require_current
+            from lexsplat.scenes.serving import counted
 
         scene = open_scene(self.scene, self.device, self.clip)
         if scene.folder is not None:
@@ -165,7 +166,8 @@ class Edit:
             self._change(editor)
         for number, step in enumerate(editor.steps, start=1):
             print(f"{number}. {step}")
-        print(f"{len(editor.scene.gaussians):,} Gaussians, {len(editor.undone)} steps undone")
+        left = counted(len(editor.scene.gaussians), "Gaussian")
+        print(f"{left}, {counted(len(editor.undone), 'step')} undone")
 
     def _discard(self, journal: Path) -> None:
         if not journal.exists():

@@ -168,7 +168,7 @@ class _Evaluation:
                 image = np.where(valid[..., None], image, photo)
             counted = 1.0 if valid is None else max(float(valid.mean()), 1e-6)
             structure = ssim(image, photo) if min(image.shape[:2]) >= 11 else None
-            scores = per_view[view.name] = {
+            per_view[view.name] = {
                 "psnr": psnr(image, photo) if valid is None else psnr(image[valid], photo[valid]),
                 "ssim": None if structure is None else 1 - (1 - structure) / counted,
                 "lpips": perceptual(image, photo) if perceptual else None,

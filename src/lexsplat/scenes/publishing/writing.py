@@ -127,7 +127,8 @@ def publish(scene: Scene, target: Path, options: PublishOptions | None = None) -
 
 def _check_scene(gaussians: Gaussians, max_splats: int | None) -> None:
     if len(gaussians) < 2:
-        raise QueryError("scene", expected="at least 2 Gaussians", found=str(len(gaussians)))
+        remedy = "undo the edit that deleted the others"
+        raise QueryError("scene", expected="at least 2 Gaussians", found=str(len(gaussians)), remedy=remedy)
     if damage := gaussians.find_invalid():
         raise QueryError("scene", expected="finite Gaussians", found=damage, remedy="build the scene again")
     if min(len(gaussians), max_splats or len(gaussians)) > MOST_SPLATS:
