@@ -102,7 +102,7 @@ def test_a_working_directory_with_other_files_is_no_output(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     SceneFolder(Path("")).refuse_foreign_files()
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(SceneFolderError, match="the working directory .*; give --output a name"):
+    with pytest.raises(SceneFolderError, match=r"the working directory .*; give --output a name"):
         SceneFolder(Path("")).refuse_foreign_files()
     (tmp_path / "scene.json").write_text("{}")
     folder = SceneFolder(tmp_path / "elsewhere")
