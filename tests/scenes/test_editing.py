@@ -323,37 +323,23 @@ def test_a_moved_thing_is_found_whole_where_it_is_now(demo, tmp_path, motion):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("phrase", "others"), [("vase", {}), ("stack of books", {"pumpkin": 1})])
-def test_what_closes_a_hole_is_no_thing(demo, phrase, others):
-    """The surface below goes on, not the remains of the thing or the rims of its neighbors."""
-    editor = Editor(demo)
-    editor.delete(demo.find(phrase))
-    found = editor.scene.find(phrase)
-    assert found.present != "yes" or found.count == 0
-    assert {name: editor.scene.find(name).count for name in others} == others
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("phrase", ["toy car", "stack of books", "vase"])
-def test_what_stands_on_a_table_still_does_when_another_thing_is_deleted(demo, phrase):
-    """The fill is denser than the table: it moves neither its ends nor the distance at which it is linked."""
+def test_a_deleted_thing_is_gone_and_all_else_stays_where_it_is(demo, phrase):
+    """Its fill is no thing, and neither are the rims of its neighbors; the ends of the table do not move."""
 
     def on_it(scene):
         return sorted(each.phrase for each in scene.find("what is on the table").instances)
 
     editor = Editor(demo)
     editor.delete(demo.find(phrase))
+    found = editor.scene.find(phrase)
+    assert found.present == (
+        "unsure" if phrase == "vase" else "no"
+    )  # white remains of other things resemble a vase
+    assert phrase not in [each.phrase for each in editor.scene.objects]
+    assert editor.scene.find("pumpkin").count == 1
     assert on_it(editor.scene) == [name for name in on_it(demo) if name != phrase]
     assert np.allclose(sorted(editor.scene.find("table").size), sorted(demo.find("table").size), atol=0.2)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("phrase", ["table lamp", "stack of books", "toy car"])
-def test_what_was_deleted_is_not_there(demo, phrase):
-    editor = Editor(demo)
-    editor.delete(demo.find(phrase))
-    assert editor.scene.find(phrase).present == "no"
-    assert phrase not in [each.phrase for each in editor.scene.objects]
 
 
 @pytest.mark.slow
