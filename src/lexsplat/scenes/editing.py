@@ -313,7 +313,9 @@ class Editor:
 
     def _do(self, kind: Kind, chosen: Selection, fill: bool = False, **values: Any) -> None:
         if len(chosen.mask) != len(self.scene.gaussians):
-            raise ValueError("the selection was made before the last edit: select again")
+            raise ValueError(
+                "the selection was made before the last edit: select again in the scene of the editor"
+            )
         if not chosen:
             raise QueryError(
                 chosen.phrase or "selection",
