@@ -67,6 +67,10 @@ _UNSEEN = 0.3
 """Trust in a pixel that no view sees. Another one gains the share of the views that see it."""
 _SIZES = (0.8, 0.8, 0.1)
 """Standard deviations of a disk along its axes, in pixels."""
+_SHEET = 0.5
+"""A thing lower than this share of its radius carries others."""
+_WAVES = 0.1
+"""Largest height of waves of the surface, in radii of the foot: what is higher around it are things."""
 _OPAQUE = 3.0
 _FLAT, _LARGE = 0.5, 0.25
 """A segment of which less is flat rises from the surface, unless it is this share of the scene, as a group is."""
@@ -193,6 +197,11 @@ def _fill_below(
     stuffing = _stuffing(gaussians, own, gone | inside, cameras)
     inside |= stuffing & ~_standing(local, own & solid, stuffing & shown)
     revealed = _revealed(gaussians, own, gone, cameras) & (local[:, 2] >= -THICK * surface.radius)
+    low, high = np.quantile(local[own & solid, 2], [0.02, 0.98])
+    if (
+        high - low < _SHEET * surface.radius
+    ):  # on a cloth or a tray stand things, whose bottoms no photo shows
+        revealed &= ~_standing(local, own & solid, revealed)
     inside |= revealed
     _, coverage, heights = from_above(gaussians, surface, flat & ~inside, photo.cells)
     near = below(local[(own | revealed) & (local[:, 2] <= 2 * surface.radius), :2], photo.cells)
@@ -203,11 +212,13 @@ def _fill_below(
     if not hole.any() or known.sum() < FEWEST:
         return None
     painted = completed(photo.colors, hole, known * (_UNSEEN + photo.shown))
-    members = np.flatnonzero(flat & ~inside & _of_surface(flat, segments))
+    thin = flat & (np.abs(local[:, 2]) <= _WAVES * surface.radius)  # a banana on a cloth is none of its waves
+    members = np.flatnonzero(thin & ~inside & _of_surface(thin, segments))
     if not len(members):
         members = np.flatnonzero(flat & ~inside)
     gone |= inside
-    raised = _continued(heights, hole, known)
+    waves = known & (np.abs(heights) <= _WAVES * surface.radius)
+    raised = _continued(heights, hole, waves if waves.sum() >= FEWEST else known)
     places = np.concatenate([photo.cells[hole], raised[:, None]], 1)
     _, nearest = cKDTree(local[members, :2]).query(photo.cells[hole])
     x, y, z, w = Rotation.from_matrix(surface.axes.T).as_quat()
