@@ -305,6 +305,9 @@ class TestImages:
         (warning,) = load_capture(tmp_path).warnings
         assert "1 of 2 photos take no part, because their masks are black: a.png" in warning
         assert "invert them" in warning
+        labels = np.ones((HEIGHT, WIDTH), np.uint16)  # dark, but not black: they count
+        Image.fromarray(labels).save(tmp_path / "masks" / "z.png.png")
+        assert len(load_capture(tmp_path).warnings) == 1
         save(tmp_path / "masks" / "z.png.png", np.zeros((HEIGHT, WIDTH)))
         fails(tmp_path, "masks with white pixels", "only black ones")
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from lexsplat.captures.capture import stem_of
-from lexsplat.captures.images.reading import IMAGE_SUFFIXES, open_image
+from lexsplat.captures.images.reading import IMAGE_SUFFIXES, open_image, read_mask
 
 _PACKED, _SMALL = 64, 1 << 20
 """A file with fewer pixels to a byte, beyond so many pixels, holds more than one color."""
@@ -61,5 +61,4 @@ def _is_black(path: Path) -> bool:
     with open_image(path) as image:
         if path.stat().st_size * _PACKED > image.width * image.height + _SMALL:
             return False
-        extrema = image.convert("L").getextrema()
-    return float(extrema[1]) == 0  # type: ignore[arg-type]
+    return not read_mask(path, nonzero=True).any()
