@@ -62,7 +62,7 @@ class Tools:
 
     def __init__(self, scenes: Mapping[str, OpenScene], library: Library | None = None) -> None:
         self.scenes, self.library = scenes, library
-        self._only = next(iter(scenes)) if len(scenes) == 1 else ""  # also after an edit has made another one
+        self._given = list(scenes)  # an edit adds others
 
     def list_scenes(self) -> Annotated[Reply, answers.ScenesAnswer]:
         """List the places that can be searched."""
@@ -313,12 +313,15 @@ class Tools:
         return Reply(" ".join((text, *heat)), document, png)
 
     def _scene(self, name: str) -> Scene:
-        name = name or self._only
+        if not name and len(self._given) == 1:
+            name = self._given[0]
         if name not in self.scenes:
             kept = self.library.names() if self.library is not None else []
             known = [*self.scenes, *kept]
-            if self.library is not None and (name in kept or (not name and len(known) == 1)):
-                return self.library.scene(name or known[0])
+            if not name and not self._given and len(kept) == 1:
+                name = kept[0]
+            if self.library is not None and name in kept:
+                return self.library.scene(name)
             raise QueryError(
                 f"scene {name[:60]!r}" if name else "scene",
                 expected=f"one of {', '.join(known)[:200]}",
