@@ -198,9 +198,7 @@ def _fill_below(
     inside |= stuffing & ~_standing(local, own & solid, stuffing & shown)
     revealed = _revealed(gaussians, own, gone, cameras) & (local[:, 2] >= -THICK * surface.radius)
     low, high = np.quantile(local[own & solid, 2], [0.02, 0.98])
-    if (
-        high - low < _SHEET * surface.radius
-    ):  # on a cloth or a tray stand things, whose bottoms no photo shows
+    if high - low < _SHEET * surface.radius:  # on a cloth stand things, whose bottoms no photo shows
         revealed &= ~_standing(local, own & solid, revealed)
     inside |= revealed
     _, coverage, heights = from_above(gaussians, surface, flat & ~inside, photo.cells)
