@@ -106,11 +106,13 @@ def part_scores(relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: 
 def _smoothed(values: FloatArray, means: FloatArray, colors: FloatArray, weights: FloatArray) -> FloatArray:
     """Values ``[M]`` averaged with those of neighbors of a like color."""
     count, neighbors = len(values), min(NEIGHBORS + 1, len(values))
-    found = cKDTree(means).query(means, k=neighbors)[1][:, 1:]
-    apart = ((colors[:, None] - colors[found]) ** 2).sum(-1) / COLOR**2
-    apart += ((values[:, None] - values[found]) / SCORE) ** 2
-    rows = np.repeat(np.arange(count), neighbors - 1)
-    links = csr_array((np.exp(-apart).ravel(), (rows, found.ravel())), shape=(count, count))
+    found = cKDTree(means).query(means, k=neighbors, workers=torch.get_num_threads())[1][:, 1:]
+    features = np.column_stack([colors / COLOR, values / SCORE])
+    apart = features[found]
+    apart -= features[:, None]
+    starts = np.arange(0, found.size + 1, neighbors - 1)
+    weighted = np.exp(-np.einsum("mkc,mkc->mk", apart, apart)).ravel()
+    links = csr_array((weighted, found.ravel(), starts), shape=(count, count))
     links = links.maximum(links.T)
     totals = np.maximum(links @ weights, 1e-9)
     smooth = values

@@ -136,9 +136,10 @@ def automatic_thresholds(scene: Scene, words: Mapping[str, Word]) -> list[float]
 
     Relative to everyday words and by segments, a score of 0.5 is the border itself.
     """
-    question, query = scene.question(list(words)), scene.query
-    if query.fixed or question.scale is not None or form_used(scene.field, query) == "segment":
+    query = scene.query
+    if query.fixed or query.everyday or form_used(scene.field, query) == "segment":
         return [query.threshold if query.fixed else BORDER] * len(words)
+    question = scene.question(list(words))
     training = [view.camera for view in scene.views.values() if view.split == "train"]
     return scene_thresholds(
         lambda camera: render_relevancy(scene.field, scene.gaussians, camera, question),
