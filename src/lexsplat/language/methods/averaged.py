@@ -18,6 +18,7 @@ at each level, from one codebook. u_G is the mean over the levels.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -43,6 +44,14 @@ from lexsplat.runtime.device import one_thread
 from lexsplat.runtime.progress import Event, Listener, silent, tell
 from lexsplat.runtime.sampling import evenly
 
+log = logging.getLogger("lexsplat")
+
+AGREEING = 0.5
+"""Usual agreement of the views, 1 - u_G, below which the features are doubted.
+
+Scenes of encoders that know their things have .66 to .86. Features of the wrong views, or mirrored ones, have .3 to
+.4, and noise 0 (docs/lab-notes/2026-11-encoders.md).
+"""
 _TOLD_FROM = 12
 """Fewest views with a forecast: the calibration takes as long as about four of them."""
 _VIEWS = 3
@@ -113,7 +122,9 @@ class Averaged:
             amount = f"{len(views.views):,} views and {len(gaussians):,} Gaussians"
             tell("language", _forecast(gaussians, views, config, run), amount)
         found = _means(gaussians, views, views.cameras, config, run)
-        return _with_language(gaussians, found, config.codebook, config.averaged, run)
+        field = _with_language(gaussians, found, config.codebook, config.averaged, run)
+        _doubt_features(field, found.totals * found.visible(config.averaged))
+        return field
 
 
 def _means(
@@ -147,6 +158,19 @@ def _with_language(
         with one_thread():
             field.segments = make_segments(gaussians, found.rows, shown, run.listener)
     return field
+
+
+def _doubt_features(field: CodeField, shown: Tensor) -> None:
+    """Warn if the views disagree about what they show; ``shown [N]`` is the weight of each Gaussian in them."""
+    agreement = float(((1 - field.uncertainties) * shown).sum() / shown.sum().clamp_min(1e-12))
+    if agreement < AGREEING:
+        log.warning(
+            "the photos disagree about the language of what they show (agreement %.2f, usually over %.2f): "
+            "answers may be wrong; the encoder may not know such things, or cameras or "
+            "features may be those of other photos",
+            agreement,
+            AGREEING,
+        )
 
 
 def _forecast(gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> float:
