@@ -20,6 +20,7 @@ from lexsplat.features.encoders import load_clip
 from lexsplat.features.hub import BUNDLED_ENCODERS
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import ModelError, SceneFolderError
+from lexsplat.scenes.answers import Word, of_part
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.records import read_record
 from lexsplat.scenes.scene import Scene
@@ -77,11 +78,37 @@ def test_a_part_lies_within_its_thing_and_is_the_smaller_share_of_it(demo, part,
     assert int((inside & ~whole).sum()) <= 0.1 * int(inside.sum())
 
 
+@pytest.mark.parametrize(
+    ("alone", "whole"),
+    [("handle", "mug handle"), ("nose", "teddy bear nose"), ("wheel", "toy car wheel")],
+)
+def test_a_part_without_its_thing_is_that_of_the_object_that_has_it(demo, alone, whole):
+    found, named = demo.ask(alone), demo.ask(whole)
+    assert found.presences[0] != "no"
+    assert torch.equal(found.scores, named.scores)
+    thing = whole.removesuffix(f" {alone}")
+    assert demo.find(alone).note == f"the {alone} of the {thing}"
+    assert torch.equal(demo.find(alone).mask, demo.find(whole).mask)
+
+
+def test_a_part_that_several_objects_have_is_that_of_each(demo):
+    mug, car = (next(each for each in demo.objects if each.phrase == name) for name in ("mug", "toy car"))
+    scores = 0.4 + 0.5 * (mug.mask | car.mask).float()
+    found = of_part(demo, "handle", Word(scores, scores, "unsure"))
+    handles = demo.ask(["mug handle", "toy car handle"])
+    held = [row for row, here in zip(handles.scores, handles.presences) if here != "no"]
+    assert held
+    assert torch.equal(found.scores, torch.stack(held).amax(0))
+    absent = Word(scores, scores, "no")
+    assert of_part(demo, "handle", absent) is absent
+
+
 def test_single_gaussians_and_the_form_of_the_paper_cut_no_parts(demo):
     alone = open_scene("demo", device="cpu")
     alone.query = replace(alone.query, form="code")
-    answer = alone.ask("mug handle")
-    assert torch.equal(answer.scores[0], answer.words[0].own)
+    for part in ("mug handle", "handle"):
+        answer = alone.ask(part)
+        assert torch.equal(answer.scores[0], answer.words[0].own)
 
 
 @pytest.mark.parametrize("prompt", ["red apple", "blue mug", "rubber duck", "pumpkin"])

@@ -42,6 +42,14 @@ export class Kinds {
     return { scores, presence: "yes", members: places, places, note: names.join(", ") };
   }
 
+  /** The names of the objects that each have at least this share of some splats. */
+  holding(splats: number[], share: number): string[] {
+    const counts = this.#objects.map(() => 0);
+    for (const i of splats) if (this.content[i] < counts.length) counts[this.content[i]]++;
+    const held = this.#objects.filter((_, place) => splats.length > 0 && counts[place] >= share * splats.length);
+    return [...new Set(held.map(({ name }) => name))];
+  }
+
   #found(): Place[] {
     const splats: number[][] = this.#objects.map(() => []);
     this.content.forEach((place, i) => splats[place]?.push(i));

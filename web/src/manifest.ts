@@ -87,6 +87,8 @@ export interface SegmentRule {
 
 /** The constants of lexsplat.queries.parts. */
 export interface PartRule {
+  /** A part without a thing is that of each object that has this share of what its name selects. */
+  held: number;
   /** Splats of a thing that can be cut, at least. */
   fewest: number;
   neighbors: number;
@@ -240,8 +242,8 @@ const FIELDS: [string, string, (value: unknown) => boolean][] = [
 
 const SEGMENT_RULE = ["lowest", "border", "own_share", "steepness", "most_certain", "below", "threshold"];
 const PART_RULE = [
-  "fewest", "neighbors", "color", "score", "rounds", "shared", "best", "lowest", "mostly", "all", "usual", "spread", "first", "last",
-  "steps", "near", "few", "outside",
+  "held", "fewest", "neighbors", "color", "score", "rounds", "shared", "best", "lowest", "mostly", "all", "usual", "spread", "first",
+  "last", "steps", "near", "few", "outside",
 ];
 const SELECTION_RULE = [
   "threshold", "link", "smallest_share", "convincing", "peak_count", "faint", "same_surface", "least_surface",

@@ -72,6 +72,11 @@ export function thingOfPart(phrase: string, rule: EverydayRule): string {
   return words.slice(0, bare.slice(0, -1).findLastIndex((word) => rule.names.includes(word)) + 1).join(" ");
 }
 
+/** Whether a phrase is one of the rule's parts without its thing, such as "handle". */
+export function isPartAlone(phrase: string, rule: EverydayRule): boolean {
+  return rule.parts.includes(phrase.toLowerCase().replace(/s$/, ""));
+}
+
 export function hasColor(phrase: string, rule: EverydayRule): boolean {
   return phrase.toLowerCase().split(/\s+/).some((word) => rule.colors.includes(word));
 }

@@ -7,7 +7,7 @@ import type { EverydayRule, PartRule } from "./manifest";
 import { partScores, withParts } from "./parts";
 import { type Language, shownSplats } from "./language";
 import { type Question, type Thing, understood } from "./questions";
-import { type Presence, hasColor, isPart, peakOf, presenceOf, strengthsOf, thingOfPart } from "./rules";
+import { type Presence, hasColor, isPart, isPartAlone, peakOf, presenceOf, strengthsOf, thingOfPart } from "./rules";
 import type { Kinds } from "./kinds";
 import type { Segments } from "./segments";
 import type { Spelling } from "./spelling";
@@ -172,20 +172,43 @@ export class Tables implements Source {
     const { threshold } = this.geometry.rule;
     if (!this.segments || presence === "no") return { scores: own, own, presence, threshold };
     const whole = this.segments.scores(own);
-    return { scores: (await this.#cut(phrase, own, whole, this.segments)) ?? whole, own, presence, threshold };
+    if (!this.cuts) return { scores: whole, own, presence, threshold };
+    if (isPartAlone(phrase, this.cuts.words)) {
+      return { scores: whole, own, ...(await this.#ofObjects(phrase, whole, this.segments, this.cuts.held)), presence, threshold };
+    }
+    return { scores: (await this.#cut(phrase, own, whole, this.segments, this.cuts)) ?? whole, own, presence, threshold };
+  }
+
+  /** A part without its thing, as that part of each object that has much of what its name selects; null if none has it. */
+  async #ofObjects(part: string, whole: Float32Array, segments: Segments, share: number) {
+    const names = this.kinds.holding(this.#seen(whole, this.geometry.rule.threshold, segments), share);
+    const found: Answer[] = [];
+    for (const name of names) {
+      const answer = await this.#plain(`${name} ${part}`, part, "");
+      if (answer && answer.presence !== "no") found.push(answer);
+    }
+    if (found.length === 0) return null;
+    const most = (rows: Float32Array[]): Float32Array => rows[0].map((_, i) => Math.max(...rows.map((row) => row[i])));
+    const scores = most(found.map((answer) => answer.scores));
+    return { scores, own: most(found.map((answer) => answer.own ?? answer.scores)), note: `the ${part} of the ${names.join(" and the ")}` };
   }
 
   /** Scores of a part, cut within its thing; null for what is none, or whose thing is not here. */
-  async #cut(phrase: string, own: Float32Array, whole: Float32Array, segments: Segments): Promise<Float32Array | null> {
-    const name = this.cuts && thingOfPart(phrase, this.cuts.words);
+  async #cut(
+    phrase: string, own: Float32Array, whole: Float32Array, segments: Segments, cuts: NonNullable<Tables["cuts"]>,
+  ): Promise<Float32Array | null> {
+    const name = thingOfPart(phrase, cuts.words);
     const thing = name ? await this.#plain(name, name, "") : null;
-    if (!this.cuts || !thing || thing.presence === "no") return null;
-    const seen = (scores: Float32Array): number[] =>
-      Array.from(scores.keys()).filter((i) => scores[i] >= thing.threshold && !segments.hidden[i]);
-    const splats = seen(thing.scores);
-    if (splats.length < this.cuts.fewest) return null;
-    const joined = withParts(splats, seen(whole), this.geometry, segments.labels);
-    return partScores(own, joined, this.geometry, segments.masses, this.cuts);
+    if (!thing || thing.presence === "no") return null;
+    const splats = this.#seen(thing.scores, thing.threshold, segments);
+    if (splats.length < cuts.fewest) return null;
+    const taken = this.#seen(whole, thing.threshold, segments);
+    return partScores(own, withParts(splats, taken, this.geometry, segments.labels), this.geometry, segments.masses, cuts);
+  }
+
+  /** The splats that reach a threshold and that a photo shows. */
+  #seen(scores: Float32Array, threshold: number, { hidden }: Segments): number[] {
+    return Array.from(scores.keys()).filter((i) => scores[i] >= threshold && !hidden[i]);
   }
 
   async refine(answer: Answer): Promise<void> {

@@ -27,6 +27,8 @@ from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.queries.clusters import LINK, spacing
 from lexsplat.queries.segments import SEGMENT_THRESHOLD
 
+HELD = 0.2
+"""A part without a thing, such as "handle", is a part of each object that has this share of what its name selects."""
 FEWEST = 50
 """Gaussians of a thing that can be cut."""
 NEIGHBORS = 10

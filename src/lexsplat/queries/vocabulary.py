@@ -9,7 +9,7 @@ _EVERYDAY = """
     ceiling, window, door, curtain, carpet, cushion, blanket, tablecloth, table, chair, sofa, bench,
     shelf, cabinet, bed, desk, computer keyboard, computer mouse, screen, phone, camera, headphones,
     cable, shoe, hat, shirt, glove, umbrella, backpack, ball, toy car, toy bulldozer, stuffed animal,
-    rubber duck, doll, bicycle, car, wheel, road, sky, water, sand, wood, metal, plastic, cloth, cat,
+    rubber duck, doll, bicycle, car, road, sky, water, sand, wood, metal, plastic, cloth, cat,
     dog, bird, person, hand, picture, mirror, stairs, fence, statue, sign, ring, cone, cube, drum,
     guitar, piano
 """
@@ -77,6 +77,11 @@ def thing_of_part(phrase: str) -> str:
         return ""
     end = max(place for place, word in enumerate(before) if word.removesuffix("s") in NAMES)
     return " ".join(before[: end + 1])
+
+
+def is_part_alone(phrase: str) -> bool:
+    """Whether a phrase is one of `PARTS` without its thing, such as "handle" or "wheels"."""
+    return phrase.lower().removesuffix("s") in PARTS
 
 
 def default_vocabulary(clip: str = "") -> list[str]:

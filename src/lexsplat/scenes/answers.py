@@ -17,7 +17,7 @@ from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.grammar import understand, undetermined
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.kinds import is_kind, is_of_kind, with_unknown_words
-from lexsplat.queries.parts import FEWEST, part_scores, with_parts
+from lexsplat.queries.parts import FEWEST, HELD, part_scores, with_parts
 from lexsplat.queries.phrases import Thing, Understood
 from lexsplat.queries.relevancy import check_prompts, render_relevancy
 from lexsplat.queries.scoring import form_used
@@ -25,7 +25,7 @@ from lexsplat.queries.selection import Presence, Selection
 from lexsplat.queries.spelling import singular
 from lexsplat.queries.thresholds import BORDER, scene_thresholds
 from lexsplat.queries.visibility import without_hidden
-from lexsplat.queries.vocabulary import STUFF, thing_of_part
+from lexsplat.queries.vocabulary import STUFF, is_part_alone, thing_of_part
 from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.progress import Event
@@ -48,6 +48,7 @@ class Word:
         presence: Whether the scene holds it, as if its words were known.
         threshold: The automatic threshold; None until it is asked for.
         selection: The selection of that threshold; None until it is asked for.
+        note: A remark on how it is answered; "" if there is none.
     """
 
     scores: Tensor
@@ -55,6 +56,7 @@ class Word:
     presence: Presence
     threshold: float | None = None
     selection: Selection | None = None
+    note: str = ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -114,6 +116,8 @@ class Answers:
         selection = self.scene.selection(
             scores >= threshold, scores, threshold=threshold, present=present, phrase=phrase
         )
+        if self.words and self.words[index].note:
+            selection = replace(selection, note=self.words[index].note)
         if phrase.lower().split()[-1] in STUFF:
             seen = replace(selection, mask=self.chosen(index))
             return replace(seen, parts=(seen,)) if seen else seen
@@ -168,17 +172,34 @@ def _members(scene: Scene, prompt: str) -> list[Selection]:
 
 def of_part(scene: Scene, prompt: str, word: Word) -> Word:
     """The word as it is, or cut within its thing if it names a part of one (`lexsplat.queries.parts`)."""
-    name, segments = thing_of_part(prompt), scene.field.segments
-    if not name or word.presence == "no" or form_used(scene.field, scene.query) != "segment" or not segments:
+    segments = scene.field.segments
+    if word.presence == "no" or form_used(scene.field, scene.query) != "segment" or not segments:
+        return word
+    taken = (word.scores >= BORDER) & ~scene.hidden
+    if is_part_alone(prompt):
+        return _of_objects(scene, prompt, word, taken)
+    name = thing_of_part(prompt)
+    if not name:
         return word
     found = scene.ask(name)
     thing = found.chosen(0)
     if found.presences[0] == "no" or int(thing.sum()) < FEWEST:
         return word
-    taken = (word.scores >= BORDER) & ~scene.hidden
     thing = with_parts(thing, taken, scene.gaussians, segments.labels)
     scores = part_scores(word.own, thing, scene.gaussians, segments.masses)
     return word if scores is None else replace(word, scores=scores)
+
+
+def _of_objects(scene: Scene, part: str, word: Word, taken: Tensor) -> Word:
+    """A part without its thing as that part of each object that has much of what its name selects: "mug handle"."""
+    least = HELD * max(int(taken.sum()), 1)
+    named = {each.phrase: each for each in scene.objects if int((taken & each.mask).sum()) >= least}
+    found = scene.ask([f"{name} {part}" for name in named], checked=True) if named else ()
+    held = [each for each, here in zip(found.words, found.presences) if here != "no"] if found else []
+    if not held:
+        return word
+    scores, own = (torch.stack(rows).amax(0) for rows in zip(*((each.scores, each.own) for each in held)))
+    return replace(word, scores=scores, own=own, note=f"the {part} of the {' and the '.join(named)}")
 
 
 def answer_queries(

@@ -36,7 +36,7 @@ from lexsplat.queries.presence import DescribedPlaces, PresenceClassifier
 from lexsplat.queries.segments import SEGMENT_THRESHOLD, segment_relevancy
 from lexsplat.queries.selection import PEAK_COUNT, SMALLEST_SHARE, Presence, Selection
 from lexsplat.queries.spelling import corrected, strange
-from lexsplat.queries.vocabulary import NAMES, STUFF, thing_of_part
+from lexsplat.queries.vocabulary import NAMES, STUFF, is_part_alone, thing_of_part
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.scenes.library.contents import Contents, projected
 
@@ -123,7 +123,9 @@ def decidable(phrase: str, clip: str) -> Thing | None:
     thing = understood.phrase
     if not isinstance(thing, Thing) or understood.note or (clip == "bundled" and not phrase.isascii()):
         return None
-    if thing_of_part(thing.text):  # compared where its thing is described
+    if thing_of_part(thing.text) or is_part_alone(
+        thing.text
+    ):  # compared where its thing is described, or cut
         return None
     known = words_of_things(clip)
     if clip == "bundled" and strange(thing.text, known):

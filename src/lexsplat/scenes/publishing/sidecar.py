@@ -41,8 +41,8 @@ def segment_rule() -> dict[str, float]:
 def part_rule() -> dict[str, float]:
     """The constants by which the page cuts parts of things: those of `lexsplat.queries.parts`."""
     return {
-        **constants_of(parts, "FEWEST", "NEIGHBORS", "COLOR", "SCORE", "ROUNDS", "SHARED", "BEST", "LOWEST"),
-        **constants_of(parts, "MOSTLY", "ALL", "USUAL", "SPREAD"),
+        **constants_of(parts, "HELD", "FEWEST", "NEIGHBORS", "COLOR", "SCORE", "ROUNDS", "SHARED", "BEST"),
+        **constants_of(parts, "LOWEST", "MOSTLY", "ALL", "USUAL", "SPREAD"),
         "first": float(parts.PLACES[0]),
         "last": float(parts.PLACES[-1]),
         "steps": len(parts.PLACES),
