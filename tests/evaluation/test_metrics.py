@@ -185,12 +185,3 @@ def test_counts_of_two_views_add_up_to_the_counts_of_both():
     assert recalls[-1] == 1
     assert np.all(np.diff(recalls) >= 0)
     assert precisions[-1] == pytest.approx(ground_truth.mean())
-
-
-# Averages
-
-
-def test_prompts_are_averaged_within_an_image_before_images():
-    values = {"a": {"x": 1.0, "y": 0.0}, "b": {"x": 1.0}, "c": {"x": math.nan}}
-    assert metrics.mean_over_images(values) == pytest.approx(0.75)
-    assert metrics.mean_over_images({"c": {"x": math.nan}}) is None

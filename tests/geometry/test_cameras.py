@@ -37,6 +37,21 @@ def test_position_and_forward_agree_with_the_inverse_of_the_pose(position, offse
     assert camera.forward == pytest.approx(pose[:3, 2], abs=1e-9)
 
 
+@given(st.lists(st.tuples(unit, unit, st.floats(-3, 3)), min_size=1, max_size=5))
+def test_points_are_projected_as_by_hand_and_those_behind_are_in_no_image(offsets):
+    camera = look_at([3, 1, 2], [0.5, 0, 0], [0, 0, 1], 64, 48, 0.9)
+    points = np.array(offsets)
+    assert camera.world(camera.local(points)) == pytest.approx(points, abs=1e-9)
+    pixels, depths, inside = camera.project(points)
+    for point, pixel, depth, shown in zip(points, pixels, depths, inside):
+        assert depth == pytest.approx((point - camera.position) @ camera.forward, abs=1e-9)
+        expected = project(camera, point)
+        near_border = min(abs(expected[0] % 64), abs(expected[1] % 48), 1.0) < 1e-6
+        assert near_border or shown == (depth > 1e-6 and 0 <= expected[0] < 64 and 0 <= expected[1] < 48)
+        if depth > 1e-3:
+            assert pixel == pytest.approx(expected)
+
+
 def test_opengl_identity_looks_along_minus_z_with_y_up():
     camera = Camera(64, 48, K, OPENGL_TO_OPENCV)  # its own inverse
     assert camera.forward == pytest.approx([0, 0, -1])

@@ -143,14 +143,14 @@ class Edit:
         """Do one action and print the steps and the size of the edited scene."""
         with starting():
             from lexsplat.scenes.editing import Editor
-            from lexsplat.scenes.journal import journal_of
+            from lexsplat.scenes.folder import file_of
             from lexsplat.scenes.previous import require_current
             from lexsplat.scenes.serving import counted
 
         scene = open_scene(self.scene, self.device, self.clip)
         if scene.folder is not None:
             require_current(scene.folder)
-        journal = journal_of(scene)
+        journal = file_of(scene.folder, "edits.jsonl")
         if self.action == "discard":
             self._discard(journal)
         with uncounted(scene.listener, "steps"):

@@ -6,13 +6,10 @@ import csv
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from lexsplat.cli.options import Device, SceneArgument, open_scene, print_json
 from lexsplat.cli.waiting import starting
-
-if TYPE_CHECKING:
-    from lexsplat.scenes.scene import Scene
 
 
 @dataclasses.dataclass
@@ -60,11 +57,12 @@ class List:
     def run(self) -> None:
         """List and print."""
         with starting():
+            from lexsplat.scenes.folder import file_of
             from lexsplat.scenes.objects import list_document, read_vocabulary
 
         names = read_vocabulary(self.vocabulary) if self.vocabulary else []
         scene = open_scene(self.scene, self.device, self.clip)
-        picture = (self.output or _sheet_of(scene)) if self.images else None
+        picture = (self.output or file_of(scene.folder, "objects.png")) if self.images else None
         document = list_document(scene, names, picture)
         if self.json:
             print_json(document)
@@ -74,13 +72,6 @@ class List:
                 print(line, file=sys.stderr)  # standard output is the table
         else:
             _print_objects(document)
-
-
-def _sheet_of(scene: Scene) -> Path:
-    """File of the thumbnails if none is given; the bundled scene is never written to."""
-    if scene.folder is None or scene.folder.is_bundled:
-        return Path("demo_objects.png")
-    return scene.folder.root / "objects.png"
 
 
 def _print_objects(document: dict[str, Any]) -> None:

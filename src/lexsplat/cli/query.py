@@ -20,7 +20,6 @@ from lexsplat.cli.options import (
 
 if TYPE_CHECKING:
     from lexsplat.queries.relevancy import QueryConfig
-    from lexsplat.scenes.scene import Scene
 
 
 @dataclasses.dataclass
@@ -98,10 +97,11 @@ class Query:
         scene = open_scene(self.scene, self.device, self.clip)
         from lexsplat.scenes.answers import answer_queries, default_views
         from lexsplat.scenes.feature_maps import write_features
+        from lexsplat.scenes.folder import file_of
         from lexsplat.scenes.serving import shortened
 
         scene.query = self._changed(scene.query)
-        folder = (self.output or _images_folder(scene)) if self.images else None
+        folder = (self.output or file_of(scene.folder, "heatmaps")) if self.images else None
         answers = answer_queries(scene, self.prompts, self.view, self.threshold, folder)
         if self.features and folder is not None:
             names = [scene.view(name).name for name in self.view] or default_views(scene)
@@ -120,10 +120,3 @@ class Query:
         print_rests_on(scene, answers["rests_on"])
         if folder:
             print(f"images in {folder}")
-
-
-def _images_folder(scene: Scene) -> Path:
-    """Folder for images if none is given; the bundled scene is never written to."""
-    if scene.folder is None or scene.folder.is_bundled:
-        return Path("demo_heatmaps")
-    return scene.folder.root / "heatmaps"

@@ -2,15 +2,15 @@
 
 The strict protocol: ground truth is binary and never resized; where sizes differ, the relevancy map is resized
 (`resize_scores`). Average precision uses every distinct score as a threshold and is the mean of the interpolated
-precision at the recalls 0, 0.01, ..., 1 (COCO), so it lies in 0..1. Prompts are averaged within an image, then images
-(`mean_over_images`). The protocols of other authors are in `evaluation.protocols`.
+precision at the recalls 0, 0.01, ..., 1 (COCO), so it lies in 0..1. The protocols of other authors are in
+`evaluation.protocols`.
 """
 
 from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -218,22 +218,6 @@ def threshold_counts(scores: ArrayLike, ground_truth: ArrayLike) -> ThresholdCou
     bins = np.searchsorted(THRESHOLDS, np.clip(values, 0, 1), side="right") - 1
     counts = [np.bincount(bins[side], minlength=1001)[::-1].cumsum()[::-1] for side in (mask, ~mask)]
     return ThresholdCounts(*counts)
-
-
-# Averages
-
-
-def mean_over_images(values: Mapping[str, Mapping[str, float]]) -> float | None:
-    """Mean over images of the mean over an image's prompts, ignoring NaN; None if nothing remains.
-
-    Args:
-        values: ``{image: {prompt: value}}``.
-    """
-    per_image = [
-        [value for value in prompts.values() if not math.isnan(value)] for prompts in values.values()
-    ]
-    means = [float(np.mean(numbers)) for numbers in per_image if numbers]
-    return float(np.mean(means)) if means else None
 
 
 def _first_line(error: BaseException) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.evaluation.metrics import MaskScores, ThresholdCounts, interpolated_precision, mean_over_images
+from lexsplat.evaluation.metrics import MaskScores, ThresholdCounts, interpolated_precision
 from lexsplat.evaluation.protocols import accuracy_at
 from lexsplat.evaluation.results import THRESHOLD_KINDS, PairResult, Pairs
 
@@ -143,7 +143,8 @@ def precision_curves(pairs: Pairs) -> dict[str, NDArray[np.float64]]:
 
 
 def _average(entries: Mapping[str, Mapping[str, Any]], name: str) -> float | None:
-    return mean_over_images({v: {p: getattr(e, name) for p, e in ps.items()} for v, ps in entries.items()})
+    """Mean over images of the mean over the prompts of an image."""
+    return mean_of([mean_of([getattr(e, name) for e in ps.values()]) for ps in entries.values()])
 
 
 def mean_of(values: Sequence[float | None]) -> float | None:

@@ -65,6 +65,25 @@ class Camera:
         """Viewing direction in world coordinates ``[3]``, unit length."""
         return np.asarray(self.viewmat[2, :3] / np.linalg.norm(self.viewmat[2, :3]), dtype=np.float64)
 
+    def local(self, points: NDArray) -> NDArray[np.float64]:
+        """World points ``[..., 3]`` in the axes of the camera."""
+        return np.asarray(points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3])
+
+    def world(self, local: NDArray) -> NDArray[np.float64]:
+        """The inverse of `local`."""
+        return np.asarray((local - self.viewmat[:3, 3]) @ self.viewmat[:3, :3])
+
+    def project(self, points: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Pixels ``[..., 2]``, depths ``[...]``, and whether in the image ``[...]``, of world points ``[..., 3]``.
+
+        Lenses do not count. The pixels of points behind the camera mean nothing.
+        """
+        local = self.local(points) @ self.K.T
+        depth = local[..., 2]
+        pixels = local[..., :2] / np.maximum(depth, 1e-6)[..., None]
+        inside = ((pixels >= 0) & (pixels < (self.width, self.height))).all(-1)
+        return pixels, depth, inside & (depth > 1e-6)
+
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for another image size; the field of view is unchanged."""
         scale = np.diag([width / self.width, height / self.height, 1.0])

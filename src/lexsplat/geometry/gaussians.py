@@ -177,3 +177,16 @@ def gaussians_from_points(
         sh0=((rgb - 0.5) / SH_C0)[:, None, :],
         shN=torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
     ).to(device)
+
+
+def joined(parts: list[Gaussians]) -> Gaussians:
+    """All Gaussians in one; missing spherical harmonics are zero."""
+    most = max(part.shN.shape[1] for part in parts)
+
+    def padded(part: Gaussians, name: str) -> Tensor:
+        tensor: Tensor = getattr(part, name)
+        missing = most - part.shN.shape[1] if name == "shN" else 0
+        return torch.nn.functional.pad(tensor, (0, 0, 0, missing)) if missing else tensor
+
+    tensors = {name: torch.cat([padded(part, name) for part in parts]) for name in TENSORS}
+    return replace(parts[0], **tensors, antialiased=all(part.antialiased for part in parts))

@@ -76,8 +76,7 @@ def surface_at(gaussians: Gaussians, camera: Camera, x: float, y: float) -> Hit:
     half = int((shares[order].cumsum(0) < shares.sum() / 2).sum())
     depth = float(depths[order[half]])
     near = ((depths - depth).abs() <= SAME_SURFACE * depth).to(seen.device)
-    ray = np.linalg.inv(camera.K) @ np.array([x, y, 1.0]) * depth
-    point = camera.viewmat[:3, :3].T @ (ray - camera.viewmat[:3, 3])
+    point = camera.world(np.linalg.inv(camera.K) @ np.array([x, y, 1.0]) * depth)
     return Hit(point, seen[near], weights[seen[near]])
 
 

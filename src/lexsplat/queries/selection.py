@@ -431,13 +431,11 @@ def _promising_views(selection: Selection) -> list[str]:
     points, areas = points[::step], areas[::step]
     found = []
     for name, camera in selection.cameras.items():
-        local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        pixels = local @ camera.K.T
-        depth = np.maximum(local[:, 2], 1e-6)
-        x, y = pixels[:, 0] / depth, pixels[:, 1] / depth
-        inside = (local[:, 2] > 1e-3) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+        _, depth, inside = camera.project(points)
         scale = camera.K[0, 0] * camera.K[1, 1] / (camera.width * camera.height)
-        found.append((float((areas * inside / depth**2).sum() * scale * inside.mean()), name))
+        found.append(
+            (float((areas * inside / np.maximum(depth, 1e-6) ** 2).sum() * scale * inside.mean()), name)
+        )
     found.sort(key=lambda entry: -entry[0])
     return [name for size, name in found[:8] if size > 0] or [found[0][1]]
 

@@ -97,7 +97,7 @@ class Viewers:
         if seen is not None and seen.complete:
             return seen.covered(one.indices)
         cameras = [self.like.cameras[name] for name in self._names]
-        return np.array([float(_shows(camera, one.center)) for camera in cameras])
+        return np.array([float(camera.project(one.center)[2]) for camera in cameras])
 
     def _answers(self, target: Selection, reference: Selection) -> NDArray[np.int64]:
         """The vote of each view ``[V]``: -1 left or in front, 1 right or behind, 0 neither."""
@@ -108,9 +108,3 @@ class Viewers:
         reach = np.abs(self._axes @ reference.box.axes.T) @ reference.box.half_sizes
         clear = (np.abs(along) > REACH * reach) & (np.abs(along) >= CONE * np.linalg.norm(level))
         return np.asarray(np.where(clear, np.sign(along), 0), np.int64)
-
-
-def _shows(camera: Camera, point: NDArray[np.float64]) -> bool:
-    """Whether a point is inside the image of a camera; other things may hide it."""
-    x, y, depth = camera.K @ (camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3])
-    return bool(depth > 0 and 0 <= x <= depth * camera.width and 0 <= y <= depth * camera.height)

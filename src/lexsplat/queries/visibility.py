@@ -156,4 +156,4 @@ def inside_hull(
         center = corners.mean(0)
         return np.asarray(Delaunay(center + grown * (corners - center)).find_simplex(places) >= 0)
     except (QhullError, ValueError, IndexError):  # flat or too few
-        return np.zeros(len(places), bool)
+        return np.zeros(places.shape[:-1], bool)

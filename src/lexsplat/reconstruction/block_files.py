@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.geometry.gaussians import TENSORS, Gaussians
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.reconstruction.blocks import Block, Blocks, side_by_side
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_json, write_json, write_tensors
@@ -316,12 +316,6 @@ class VisitsOfGroup(Mapping[str, tuple[Visit, Mapping[str, bytes] | None]]):
 
     def __len__(self) -> int:
         return len(self.visits)
-
-
-def merged(parts: list[Gaussians]) -> Gaussians:
-    """The Gaussians of all parts."""
-    tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in TENSORS}
-    return Gaussians(**tensors, antialiased=parts[0].antialiased)
 
 
 def idle(state: CellState, name: str, rate: float, steps: int, at: int) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.gaussians import Gaussians, joined
 from lexsplat.reconstruction.block_files import (
     BETAS,
     EXPOSURES,
@@ -30,7 +30,6 @@ from lexsplat.reconstruction.block_files import (
     Visit,
     VisitsOfGroup,
     idle,
-    merged,
     plan,
 )
 from lexsplat.reconstruction.blocks import Blocks, cut_blocks, ground_axes
@@ -203,7 +202,7 @@ class VisitReconstructor(Reconstructor):
 
     def _render(self, gaussians: Gaussians, camera: Camera) -> Rendering:
         if self._around is not None:
-            gaussians = merged([gaussians, self._around.in_image(camera)])
+            gaussians = joined([gaussians, self._around.in_image(camera)])
         return super()._render(gaussians, camera)
 
     def _control_density(self, means2d: Tensor, radii: Tensor, image_size: tuple[int, int]) -> None:
@@ -290,7 +289,7 @@ def reconstruct_blocks(
             files.remove_old(index + 1)
         latest = files.latest(len(groups))
         parts = [files.gaussians(latest[str(cell)][0], cell, config.antialiased) for cell in range(count)]
-    return merged(parts)
+    return joined(parts)
 
 
 def _seen_by(group: list[Visit], capture: Capture) -> Capture:

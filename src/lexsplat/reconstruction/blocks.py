@@ -30,7 +30,6 @@ from lexsplat.runtime.errors import CaptureError
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, View
-    from lexsplat.geometry.cameras import Camera
 
 CELLS_TRAINED = 4
 """Cells that a block trains at most, if every other cell is trained by another block."""
@@ -313,10 +312,10 @@ def _shares(
     view: View, points: NDArray[np.float32], homes: NDArray[np.int64], count: int
 ) -> NDArray[np.float64]:
     """Share of each cell ``[B]`` in a view: of the points that it shows, each by its area in the image."""
-    shown, depth = _shown(view.camera, points)
-    if not len(shown):
+    _, depth, shown = view.camera.project(points)
+    if not shown.any():
         return np.zeros(count)
-    area = np.maximum(depth, np.quantile(depth, 0.1)) ** -2
+    area = np.maximum(depth[shown], np.quantile(depth[shown], 0.1)) ** -2
     return np.bincount(homes[shown], area, count) / area.sum()
 
 
@@ -329,17 +328,6 @@ def _cells_of(
     for number, cell in enumerate(cells):  # one mask at a time: a large capture has many cells
         found[cell.holds(ground)] = number
     return found
-
-
-def _shown(camera: Camera, points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Indices ``[S]`` of the points in an image and their depths ``[S]``."""
-    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    depth = local[:, 2]
-    places = local[:, :2] / np.maximum(depth[:, None], 1e-9)
-    places = places * [camera.K[0, 0], camera.K[1, 1]] + camera.K[:2, 2]
-    inside = (places >= 0) & (places < (camera.width, camera.height))
-    shown = np.flatnonzero((depth > 0) & inside.all(1))
-    return shown, depth[shown]
 
 
 def _cut(ground: NDArray[np.float64], count: int) -> list[tuple[NDArray, NDArray]]:

@@ -74,10 +74,7 @@ def _points_of(
     """Points of a share of the pixels of a view ``[P, 3]``, world, and their colors ``[P, 3]``."""
     camera = view.camera
     size, focal = np.array([camera.width, camera.height]), np.diag(camera.K)[:2]
-    local = known @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    local = local[local[:, 2] > 1e-6]
-    places = local[:, :2] / local[:, 2:] * focal + camera.K[:2, 2]
-    inside = ((places >= 0) & (places < size)).all(1)
+    places, depth, inside = camera.project(known)
     if not inside.any():
         return np.zeros((0, 3)), np.zeros((0, 3), np.float32)
     chosen = rng.random((round(share * size.prod()), 2)) * size
@@ -85,10 +82,9 @@ def _points_of(
     if (valid := view.load_valid()) is not None:
         counted = valid[rows, columns]
         chosen, columns, rows = chosen[counted], columns[counted], rows[counted]
-    depths = local[inside, 2][cKDTree(places[inside]).query(chosen)[1]]
+    depths = depth[inside][cKDTree(places[inside]).query(chosen)[1]]
     rays = np.column_stack([(chosen - camera.K[:2, 2]) / focal, np.ones(len(chosen))])
-    points = (rays * depths[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
-    return points, view.load_image()[rows, columns]
+    return camera.world(rays * depths[:, None]), view.load_image()[rows, columns]
 
 
 def warn_of_few_photos(capture: Capture, gaussians: Gaussians) -> None:

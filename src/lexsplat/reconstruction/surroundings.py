@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.reconstruction.block_files import merged
+from lexsplat.geometry.gaussians import Gaussians, joined
 
 if TYPE_CHECKING:
     from lexsplat.geometry.cameras import Camera
@@ -53,7 +52,7 @@ class Surroundings:
             parts.append(cell.select(torch.from_numpy(np.flatnonzero(taking))))
             extents.append(own[taking])
             draws.append(drawn[taking])
-        return cls(merged(parts), np.concatenate(extents), np.concatenate(draws))
+        return cls(joined(parts), np.concatenate(extents), np.concatenate(draws))
 
     def __len__(self) -> int:
         return len(self.gaussians)

@@ -38,7 +38,6 @@ from lexsplat.scenes.surfaces import (
     FEWEST,
     THICK,
     Orthophoto,
-    below,
     from_above,
     looked_up,
     photographed,
@@ -202,7 +201,7 @@ def _fill_below(
         revealed &= ~_standing(local, own & solid, revealed)
     inside |= revealed
     _, coverage, heights = from_above(gaussians, surface, flat & ~inside, photo.cells)
-    near = below(local[(own | revealed) & (local[:, 2] <= 2 * surface.radius), :2], photo.cells)
+    near = inside_hull(local[(own | revealed) & (local[:, 2] <= 2 * surface.radius), :2], photo.cells, 1.0)
     filled = binary_dilation(unseen, iterations=_OVERLAP)
     hole = filled | ((near | binary_dilation(filled, iterations=_OVERLAP)) & (coverage < _BARE))
     level = np.abs(heights) <= THICK * surface.radius

@@ -380,3 +380,10 @@ def _pixel_data(content: bytes, size: tuple[int, int]) -> bytes:
             packed.append(content[place + 8 : place + 8 + length])
         place += 12 + length
     return zlib.decompressobj().decompress(b"".join(packed), size[1] * (size[0] + 1) + 1)
+
+
+def file_of(folder: SceneFolder | None, name: str) -> Path:
+    """A file or folder that a command writes for a scene; the bundled one is never written to."""
+    if folder is None or folder.is_bundled:
+        return Path(f"demo_{name}")
+    return folder.root / name

@@ -240,10 +240,3 @@ def _lock(file: IO[str]) -> None:
     except ImportError:  # Windows has no flock: two writers at the same moment are not detected
         return
     fcntl.flock(file, fcntl.LOCK_EX)
-
-
-def journal_of(scene: Scene) -> Path:
-    """File of the steps of an edit; the bundled scene is never written to."""
-    if scene.folder is None or scene.folder.is_bundled:
-        return Path("demo_edits.jsonl")
-    return scene.folder.root / "edits.jsonl"

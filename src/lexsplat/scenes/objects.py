@@ -228,9 +228,7 @@ def _thumbnail(scene: Scene, thing: Selection) -> Image.Image:
     if camera is None:
         return Image.new("RGB", _TILE)
     image = scene.render(camera).image.clamp(0, 1).cpu().numpy()
-    local = thing.box.corners @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    pixels = local @ camera.K.T
-    pixels = pixels[:, :2] / np.maximum(pixels[:, 2:], 1e-6)
+    pixels, _, _ = camera.project(thing.box.corners)
     low, high = pixels.min(0), pixels.max(0)
     reach = _MARGIN * float((high - low).max())
     limits = np.array([camera.width, camera.height])

@@ -15,7 +15,6 @@ from typing import NamedTuple, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay, QhullError
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
@@ -185,11 +184,9 @@ def looked_up(
         with torch.no_grad():
             view = render(gaussians, small, features=thing, depth=True)
         nearest = cast(torch.Tensor, view.depth).cpu().numpy()
-        x, y, depth = ((places @ small.viewmat[:3, :3].T + small.viewmat[:3, 3]) @ small.K.T).T
-        front = np.maximum(depth, 1e-9)
-        x, y = np.floor(x / front), np.floor(y / front)
-        here = np.flatnonzero((depth > 0) & (x >= 0) & (y >= 0) & (x < small.width) & (y < small.height))
-        pixels = y[here].astype(int), x[here].astype(int)
+        found, depth, inside = small.project(places)
+        here = np.flatnonzero(inside)
+        pixels = tuple(found[here, ::-1].astype(int).T)
         there = nearest[pixels] > depth[here] - slack
         before = view.features[..., 0].cpu().numpy()[pixels] > _BEFORE
         counts[here] += 1
@@ -236,14 +233,6 @@ def from_above(
     alpha = alpha.reshape(count, count)
     safe = np.maximum(alpha, 1e-6)
     return image / safe[..., None], alpha, heights / safe
-
-
-def below(points: FloatArray, cells: FloatArray) -> Mask:
-    """Which cells ``[P, P, 2]`` lie in the convex hull of points ``[M, 2]``."""
-    try:
-        return np.asarray(Delaunay(points).find_simplex(cells) >= 0)
-    except (QhullError, ValueError):
-        return np.zeros(cells.shape[:2], bool)
 
 
 def _cells(surface: Surface, cameras: Sequence[Camera]) -> tuple[FloatArray, float]:

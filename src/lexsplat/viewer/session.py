@@ -26,7 +26,7 @@ from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.exporting import export_scene
-from lexsplat.scenes.journal import journal_of
+from lexsplat.scenes.folder import file_of
 from lexsplat.scenes.publishing.manifest import MOST_OBJECTS, checksums, object_entries, scene_manifest
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.vocabulary import NAME, page_phrases, words_file
@@ -74,8 +74,10 @@ class Session:
     def __init__(self, scene: Scene, splats: int, history: History) -> None:
         self.lock = threading.RLock()
         self.history, self._splats = history, splats
-        writable = scene.folder is not None and os.access(journal_of(scene).absolute().parent, os.W_OK)
-        self.editor = Editor(scene, journal_of(scene) if writable else None, self._prepare)
+        writable = scene.folder is not None and os.access(
+            file_of(scene.folder, "edits.jsonl").absolute().parent, os.W_OK
+        )
+        self.editor = Editor(scene, file_of(scene.folder, "edits.jsonl") if writable else None, self._prepare)
         self.version = 1
         self.closed = False
         """Ends `warm_up`."""

@@ -178,7 +178,7 @@ def random_points_in_frusta(
         rays = np.ones((len(mine), 10, 3))
         rays[..., :2] = (pixels[mine] * size - camera.K[:2, 2]) / [camera.K[0, 0], camera.K[1, 1]]
         rays *= (fractions[mine] * distance)[..., None]
-        candidates = (rays - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+        candidates = camera.world(rays)
         best = _views_that_see(views, candidates.reshape(-1, 3)).reshape(-1, 10).argmax(1)
         rows = np.arange(len(mine))
         points[mine] = candidates[rows, best]
@@ -204,14 +204,7 @@ def _focus_distance(views: tuple[View, ...], extent: float) -> float:
 
 def _views_that_see(views: tuple[View, ...], points: NDArray[np.float64]) -> NDArray[np.int64]:
     """Number of views ``[P]`` in whose image each point ``[P, 3]`` falls."""
-    counts = np.zeros(len(points), dtype=np.int64)
-    for view in views:
-        camera = view.camera
-        local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        depth = np.maximum(local[:, 2:], 1e-9)
-        x, y = (local[:, :2] / depth * [camera.K[0, 0], camera.K[1, 1]] + camera.K[:2, 2]).T
-        counts += (local[:, 2] > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    return counts
+    return sum((view.camera.project(points)[2] for view in views), np.zeros(len(points), np.int64))
 
 
 def matching_pairs(views: tuple[View, ...]) -> list[tuple[int, int]]:

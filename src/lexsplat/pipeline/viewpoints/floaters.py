@@ -190,11 +190,8 @@ def _gaps(
     NaN stands for points outside of the view and for pixels that are not opaque.
     """
     surface, _, alpha = draw_depth(gaussians, camera)
-    rotated = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    depths = rotated[..., 2]
+    pixels, depths, within = camera.project(points)
     depths = np.where(depths > 0, depths, np.nan)
-    pixels = (rotated @ camera.K.T)[..., :2] / depths[..., None]
-    within = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
     columns, rows = pixels[within].astype(int).T
     gaps = np.full(depths.shape, np.nan)
     gaps[within] = np.where(alpha[rows, columns] > 0.8, surface[rows, columns] / depths[within] - 1, np.nan)

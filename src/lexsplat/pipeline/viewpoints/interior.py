@@ -221,5 +221,4 @@ def _seen_points(camera: Camera, depth: Image) -> NDArray[np.float64]:
     """The points of the drawn pixels ``[M, 3]``, world."""
     rows, columns = np.nonzero(np.isfinite(depth))
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], 1)
-    local = pixels @ np.linalg.inv(camera.K).T * depth[rows, columns, None]
-    return np.asarray((local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
+    return camera.world(pixels @ np.linalg.inv(camera.K).T * depth[rows, columns, None])

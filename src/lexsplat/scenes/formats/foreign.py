@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.captures.readers.camera_files import MAX_COORDINATE
-from lexsplat.geometry.gaussians import LARGEST, TENSORS, Gaussians
+from lexsplat.geometry.gaussians import LARGEST, Gaussians
 from lexsplat.runtime.errors import FileFormatError
 
 logger = logging.getLogger(__name__)
@@ -292,16 +292,3 @@ def rounded_centers(places: NDArray[np.float64], log_scales: Tensor, path: Path)
             path, error, size, middle,
         )  # fmt: skip
     return means
-
-
-def joined(parts: list[Gaussians]) -> Gaussians:
-    """All Gaussians in one; missing spherical harmonics are zero."""
-    most = max(part.shN.shape[1] for part in parts)
-
-    def padded(part: Gaussians, name: str) -> Tensor:
-        tensor: Tensor = getattr(part, name)
-        missing = most - part.shN.shape[1] if name == "shN" else 0
-        return torch.nn.functional.pad(tensor, (0, 0, 0, missing)) if missing else tensor
-
-    tensors = {name: torch.cat([padded(part, name) for part in parts]) for name in TENSORS}
-    return replace(parts[0], **tensors, antialiased=all(part.antialiased for part in parts))

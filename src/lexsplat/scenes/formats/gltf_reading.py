@@ -22,12 +22,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.gaussians import Gaussians, joined
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.foreign import (
     Damage,
     as_tensor,
-    joined,
     parsing,
     read_content,
     rounded_centers,

@@ -12,9 +12,9 @@ from typing import Any
 
 import torch
 
-from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.gaussians import Gaussians, joined
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.scenes.formats.foreign import Damage, damaged, joined, parsing, read_content, warn
+from lexsplat.scenes.formats.foreign import Damage, damaged, parsing, read_content, warn
 from lexsplat.scenes.formats.sog import read_sog
 
 LOD_META = "lod-meta.json"

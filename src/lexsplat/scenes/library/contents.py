@@ -324,9 +324,9 @@ def _images(scene: Scene, means: Tensor) -> dict[str, Any]:
         cameras.append(camera)
         if drawn.depth is not None:
             depth = drawn.depth.cpu().numpy()
-            x, y, z, inside = projected(camera, means.double().numpy())
-            at = depth[y[inside].astype(int), x[inside].astype(int)]
-            seen[np.flatnonzero(inside)[z[inside] <= at * (1 + _BEHIND)]] |= np.uint8(1 << number)
+            pixels, z, inside = camera.project(means.double().numpy())
+            x, y = pixels[inside].astype(int).T
+            seen[np.flatnonzero(inside)[z[inside] <= depth[y, x] * (1 + _BEHIND)]] |= np.uint8(1 << number)
     return {
         "views": list(names),
         "seen": torch.from_numpy(seen),
@@ -336,12 +336,3 @@ def _images(scene: Scene, means: Tensor) -> dict[str, Any]:
         "ends": torch.from_numpy(np.cumsum([len(file) for file in files], dtype=np.int64)).int(),
         "pictures": _bytes(b"".join(files)),
     }
-
-
-def projected(camera: Camera, points: Array) -> tuple[Array, Array, Array, Array]:
-    """Pixels x and y and depths of points ``[M, 3]``, and whether they are in the image, ``[M]`` each."""
-    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    depth = np.maximum(local[:, 2], 1e-6)
-    x, y = (local @ camera.K.T)[:, :2].T / depth
-    inside = (local[:, 2] > 1e-3) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-    return x, y, depth, inside

@@ -38,7 +38,7 @@ from lexsplat.queries.selection import PEAK_COUNT, SMALLEST_SHARE, Presence, Sel
 from lexsplat.queries.spelling import corrected, strange
 from lexsplat.queries.vocabulary import NAMES, STUFF, is_part_alone, thing_of_part
 from lexsplat.runtime.errors import SceneFolderError
-from lexsplat.scenes.library.contents import Contents, projected
+from lexsplat.scenes.library.contents import Contents
 
 _LARGE = 0.05
 """Phrases without an everyday name that select this share of a scene are left to it."""
@@ -269,10 +269,10 @@ def _best_view(contents: Contents, part: Array) -> tuple[int, tuple[int, int, in
         if not here.any():
             continue
         camera = contents.camera(number)
-        x, y, depth, inside = projected(camera, points[here])
+        pixels, depth, inside = camera.project(points[here])
         shown = float((camera.K[0, 0] / depth[inside] ** 2).sum()) if inside.any() else 0.0
         if shown > best[0]:
-            x, y = x[inside], y[inside]
+            x, y = pixels[inside].T
             edges = (x.min() - 2, y.min() - 2, x.max() + 2, y.max() + 2)
             frame = tuple(round(float(edge)) for edge in edges)
             best = (shown, number, frame)  # type: ignore[assignment]
