@@ -49,6 +49,37 @@ def test_photos_are_registered_and_the_unregistered_one_is_named(room):
     assert events[-1].metrics == {"registered": 9, "photos": 10}
 
 
+def test_photos_of_several_sizes_and_lenses_all_have_features(tmp_path):
+    folder = tmp_path / "photos"
+    for index, camera in enumerate(room_cameras()[:6]):
+        photo = room_photo(camera)
+        save(folder / f"{index}.png", (photo, photo[:, 40:-40], photo[::2, ::2])[index % 3])
+    prepared = prepare_photos(folder, tmp_path / "out")
+    assert len(prepared.lenses) == 3
+    database = tmp_path / "database.db"
+    with quiet_pycolmap(0):
+        mapping.extract_features(database, prepared, PoseConfig(), 4 << 30, lambda done: None)
+    with pycolmap.Database.open(database) as opened:
+        counts = {
+            each.name: opened.num_keypoints_for_image(each.image_id) for each in opened.read_all_images()
+        }
+    assert sorted(counts) == [f"{index}.png" for index in range(6)]
+    assert min(counts.values()) > 100, counts
+
+
+def test_each_unregistered_photo_has_its_reason(room, tmp_path):
+    folder, poses, _ = room
+    assert poses.note.endswith(
+        "unregistered: unrelated.png (has nothing to match: blurred, dark or without texture)"
+    )
+    noise = np.random.default_rng(0).random((SIZE[1], SIZE[0], 3))
+    for index in range(4):
+        shutil.copy(folder / f"{index}.png", tmp_path)
+    save(tmp_path / "noise.png", noise)
+    found = poses_from_photos(tmp_path, tmp_path / "out")
+    assert found.note.endswith("unregistered: noise.png (matches no other photo)")
+
+
 def test_progress_counts_the_pairs_of_photos(room):
     _, _, events = room
     pairs = [event for event in events if event.stage == "matching"]

@@ -109,10 +109,9 @@ def extract_features(
     reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
     if photos.masks is not None:
         reader.mask_path = _complete_masks(photos, photos.masks, database.parent / "all-masks")
-    single = pycolmap.CameraMode.SINGLE
     for group in photos.lenses:
         # Importing first assigns image ids in order; extraction alone assigns them as threads finish.
-        pycolmap.import_images(database, photos.images, single, list(group), reader)
+        pycolmap.import_images(database, photos.images, pycolmap.CameraMode.SINGLE, list(group), reader)
     masked = photos.masks is not None
     threads = extraction_threads(photos.largest, config.max_side, config.max_features, memory, masked=masked)
     options = pycolmap.FeatureExtractionOptions(max_image_size=config.max_side, num_threads=threads)
@@ -123,7 +122,7 @@ def extract_features(
             database,
             photos.images,
             batch,
-            camera_mode=single,
+            camera_mode=pycolmap.CameraMode.PER_IMAGE,  # as imported; others skip what another lens took
             reader_options=reader,
             extraction_options=options,
             device=pycolmap.Device.cpu,
@@ -280,6 +279,22 @@ def matched(database: Path) -> set[str]:
         pairs = zip(*opened.read_two_view_geometries())
         kept = [pair for pair, geometry in pairs if len(geometry.inlier_matches) >= MIN_MATCHES]
     return {names[number] for pair in kept for number in pycolmap.pair_id_to_image_pair(pair)}
+
+
+def why_unregistered(database: Path, names: Collection[str]) -> dict[str, str]:
+    """The reason why each photo has no pose."""
+    with_matches = matched(database)
+    with pycolmap.Database.open(database) as opened:
+        counts = {
+            each.name: opened.num_keypoints_for_image(each.image_id) for each in opened.read_all_images()
+        }
+
+    def reason(name: str) -> str:
+        if counts.get(name, 0) < MIN_MATCHES:
+            return "has nothing to match: blurred, dark or without texture"
+        return "fits no model of the others" if name in with_matches else "matches no other photo"
+
+    return {name: reason(name) for name in names}
 
 
 def write_model(model: pycolmap.Reconstruction, output: Path) -> None:

@@ -12,8 +12,8 @@ from __future__ import annotations
 import contextlib
 import itertools
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -86,6 +86,7 @@ class PhotoPoses:
         mapper: Mapper that found the model.
         all_pairs: Whether photos that sequential matching left unregistered were matched with all others for it.
         notes: Remarks for the user, one line each.
+        reasons: Why each of the unregistered photos has no pose, by name.
     """
 
     root: Path
@@ -97,6 +98,7 @@ class PhotoPoses:
     mapper: Mapper = "incremental"
     all_pairs: bool = False
     notes: tuple[str, ...] = ()
+    reasons: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def is_complete(self) -> bool:
@@ -113,7 +115,11 @@ class PhotoPoses:
         line = f'{line}, found by the mapper "{self.mapper}"'
         if self.all_pairs:
             line = f"{line} after all pairs of the unregistered photos were matched"
-        return line if not self.unregistered else f"{line}; unregistered: {', '.join(self.unregistered)}"
+        of_reason = [(self.reasons.get(name, ""), name) for name in self.unregistered]
+        for reason, group in itertools.groupby(sorted(of_reason), lambda each: each[0]):
+            names = ", ".join(name for _, name in group)
+            line = f"{line}; unregistered: {names}" + (f" ({reason})" if reason else "")
+        return line
 
 
 def poses_from_photos(
@@ -175,6 +181,7 @@ def poses_from_photos(
             _discard(work, output)
             raise _none_registered(folder, len(names))
         unregistered = mapping.unregistered(names, best)
+        reasons = mapping.why_unregistered(database, unregistered)
         mapping.write_model(best.model, output)
     _discard(work, output)
     registered = tuple(sorted(set(names) - set(unregistered)))
@@ -190,6 +197,7 @@ def poses_from_photos(
         best.mapper,
         best.all_pairs,
         photos.notes,
+        reasons,
     )
 
 
