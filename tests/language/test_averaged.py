@@ -246,23 +246,6 @@ def test_known_labels_and_features_are_recovered(balls) -> None:
     assert label_accuracy(renamed, balls) > 0.97
 
 
-@pytest.mark.parametrize(("spoiled", "told"), [("nothing", 0), ("order of views", 1), ("all", 1)])
-def test_features_that_disagree_about_the_scene_are_doubted(spoiled, told, balls, caplog) -> None:
-    names = list(balls.cameras)
-    maps = features_of_codes(balls.code_maps, balls.codebook)
-    if spoiled == "order of views":
-        maps = {name: maps[other] for name, other in zip(names, names[len(names) // 2 :] + names)}
-    elif spoiled == "all":
-        maps = random_features(balls.cameras)
-    views = {
-        name: SimpleNamespace(camera=camera, load_valid=lambda size: None)
-        for name, camera in balls.cameras.items()
-    }
-    config = BuildConfig(codebook=CODES)
-    METHODS["averaged"].fit(balls.gaussians, TrainingViews(views, features=maps), config, FitRun())
-    assert sum("disagree about the language" in message for message in caplog.messages) == told
-
-
 def test_an_object_keeps_its_code_despite_random_disagreement(balls) -> None:
     """One ball of five is seen as itself in 60 % of its pixels only; the mean over views still identifies it."""
     generator = np.random.default_rng(1)

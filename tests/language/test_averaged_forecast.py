@@ -1,4 +1,4 @@
-"""Claims about the time that averaging tells beforehand."""
+"""Claims about what averaging tells: the time beforehand, and features that do not agree."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 from support.language_scene import make_scene
+from torch.nn.functional import normalize
 
 from lexsplat.codebook import CodebookConfig
+from lexsplat.features import FeatureMap
 from lexsplat.language.methods import METHODS, averaged
 from lexsplat.language.methods.averaged import features_of_codes
 from lexsplat.language.methods.method import FitRun, TrainingViews
@@ -57,3 +59,25 @@ def test_the_time_is_that_of_a_few_views_and_gaussians_and_they_leave_no_trace(m
     ]
     for name, tensor in silent.tensors().items():
         assert torch.equal(tensor, told.tensors()[name]), name
+
+
+@pytest.mark.parametrize(("spoiled", "told"), [("nothing", 0), ("order of views", 1), ("all", 1)])
+def test_features_that_disagree_about_the_scene_are_doubted(spoiled, told, caplog) -> None:
+    balls = make_scene()
+    names = list(balls.cameras)
+    maps = features_of_codes(balls.code_maps, balls.codebook)
+    if spoiled == "order of views":
+        maps = {name: maps[other] for name, other in zip(names, names[len(names) // 2 :] + names)}
+    elif spoiled == "all":
+        noise = torch.Generator().manual_seed(0)
+        maps = {
+            name: FeatureMap(normalize(torch.randn(camera.height, camera.width, 7, generator=noise), dim=-1))
+            for name, camera in balls.cameras.items()
+        }
+    views = {
+        name: SimpleNamespace(camera=camera, load_valid=lambda size: None)
+        for name, camera in balls.cameras.items()
+    }
+    config = BuildConfig(codebook=CodebookConfig(num_codes=5, use_dino=False))
+    METHODS["averaged"].fit(balls.gaussians, TrainingViews(views, features=maps), config, FitRun())
+    assert sum("disagree about the language" in message for message in caplog.messages) == told

@@ -1,6 +1,7 @@
 """Answers to unions, counts and widths, on groups of points at known places."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -98,3 +99,18 @@ def test_an_exception_leaves_the_next_one_of_a_superlative(select):
     words["board"] = select("board")
     (found,) = asked("the closest thing to the pole except the board", words, objects).instances
     assert found.phrase == "other apple"
+
+
+def test_what_has_a_part_is_not_without_it(select):
+    both = select("apple", "other apple")
+    words = {"apple": both, "apple stem": select("other apple", first=20)}
+    assert torch.equal(asked("apple without stem", words).mask, select("apple").mask)
+    assert asked("apple without a stem", {**words, "apple stem": both}).present == "no"
+    gone = replace(words["apple stem"], present="no")
+    assert asked("apple without stem", {**words, "apple stem": gone}).count == 2
+
+
+def test_what_is_a_thing_of_another_name_is_taken_off(select):
+    words = {"toy": select("apple", "board", "pole"), "apple": select("apple", "other apple")}
+    assert torch.equal(asked("toys that are not apples", words).mask, select("board", "pole").mask)
+    assert torch.equal(asked("toys that are apples", words).mask, select("apple").mask)

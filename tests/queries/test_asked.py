@@ -188,6 +188,25 @@ def test_an_exception_is_taken_off_before_the_superlative_picks(text, expected):
         ("the widest thing", Pick("widest", ANY)),
         ("the longest thing on the table", Pick("longest", Related("on", ANY, TABLE))),
         ("where do I put flowers", Thing("something to put flowers in")),
+        ("3 or more toys", AtLeast(3, TOY)),
+        ("are there two or more mugs on the table?", AtLeast(2, Related("on", MUG, TABLE))),
+        ("how many wheels does the toy car have?", Thing("toy car wheel")),
+        ("what can be seen behind the mug?", Related("behind", ANY, MUG)),
+        ("what supports the apple?", Related("under", ANY, APPLE)),
+        ("where is the duck standing?", DUCK),
+        ("are the apple and the mug next to each other?", Related("next to", APPLE, MUG)),
+        ("toys that are not apples", Except(TOY, APPLE)),
+        ("things that are not toys", Except(ANY, TOY)),
+        ("red things that are not mugs", Except(Colored("red", ANY), MUG)),
+        ("things on the table that are not red mugs", Except(Related("on", ANY, TABLE), Thing("red mug"))),
+        ("which things are toys?", TOY),
+        ("things that are animals", Thing("animal")),
+        ("toys that are animals", Except(TOY, Except(TOY, Thing("animal")))),
+        ("vases that are glass", Thing("glass vase")),
+        ("mug without handle", Except(MUG, Thing("mug handle"), lacks=True)),
+        ("is there a mug without a handle?", Except(MUG, Thing("mug handle"), lacks=True)),
+        ("mug except the handle", Except(MUG, Thing("handle"))),
+        ("toys without the duck", Except(TOY, DUCK)),
         ("exactly two mugs", AtLeast(2, MUG, 2)),
         ("is there only one duck?", AtLeast(1, DUCK, 1)),
         ("is there exactly one mug?", AtLeast(1, MUG, 1)),
@@ -239,6 +258,8 @@ def test_what_a_question_asks_beside_the_thing_is_reported(text, expected, told)
         ("Half of the mugs", "Half"),
         ("WHY is it red", "WHY"),
         ("at most two toys", "at"),
+        ("0 toys", "0"),
+        ("at least 0 toys", "0"),
         ("fewer than five apples", "fewer"),
     ],
 )
@@ -284,6 +305,13 @@ def test_a_statement_that_the_grammar_cannot_check_is_said(question, word):
     understood = understand(question)
     assert understood.unknown
     assert f'not understood ("{word}")' in understood.note
+
+
+@pytest.mark.parametrize("state", ["dead", "lit", "ripe", "heavy"])
+def test_a_state_that_photos_may_not_tell_is_asked_as_an_adjective_and_said(state):
+    found = understand(f"is the mug {state}?")
+    assert (found.phrase, found.unknown) == (Thing(f"{state} mug"), True)
+    assert "photos may not tell" in found.note
 
 
 def test_a_scene_is_one_moment():

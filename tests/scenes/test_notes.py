@@ -38,6 +38,29 @@ def test_negatives_exceptions_and_exact_numbers_are_answered_rightly(demo, quest
     ]
 
 
+@pytest.mark.parametrize(
+    ("phrase", "told"),
+    [
+        ("half of the toys", "not understood"),
+        ("roter Apfel", "knows English words alone"),
+        ("is the mug empty?", "photos may not tell"),
+        ("what color is the mug?", "the answer is the thing"),
+        ("bananna", "may be a typing error"),
+    ],
+)
+def test_python_is_told_what_the_command_line_is_told(demo, phrase, told):
+    found = demo.find(phrase)
+    (answer,) = find_phrases(demo, phrase)["phrases"]
+    assert told in found.note
+    assert found.note == answer["note"] == found.to_dict()["note"]
+
+
+def test_the_same_phrase_in_other_words_has_a_note_of_its_own(demo):
+    assert not demo.find("banana").note
+    assert "typing error" in demo.find("bananna").note
+    assert not demo.find("banana").note
+
+
 def test_one_phrase_that_is_no_words_leaves_the_others_of_a_batch_answered(demo):
     mug, nothing, place, duck = find_phrases(demo, ["mug", "...", "is the lamp on?", "duck"])["phrases"]
     assert (mug["present"], duck["present"]) == ("yes", "yes")

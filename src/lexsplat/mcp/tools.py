@@ -403,15 +403,14 @@ def asked_of(scene: Scene, phrase: str) -> tuple[Selection, dict[str, Any]]:
         QueryError: If the scene does not hold it.
     """
     understood, found = scene.understand(phrase), scene.find(phrase)
-    noted = _joined(understood.note, found.note)
     if found.present == "no" or not found:
-        note = f" ({noted})" if noted else ""
+        note = f" ({found.note})" if found.note else ""
         raise QueryError(
             phrase[:60],
             expected="something that the scene holds",
             found=f"not here: nothing fits {shortened(str(understood.phrase))}{note}",
         )
-    return found, {"understood": str(understood.phrase), "note": noted, **answers.certainty(found)}
+    return found, {"understood": str(understood.phrase), "note": found.note, **answers.certainty(found)}
 
 
 def _joined(*notes: str) -> str:

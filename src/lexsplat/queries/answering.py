@@ -237,12 +237,24 @@ def _united(first: Selection, second: Selection, colors_of_one: bool = False) ->
 def _except(phrase: Except, searched: Searched) -> Selection:
     first, second = answer(phrase.first, searched), answer(phrase.second, searched)
     others = _certain(second)
+    if phrase.lacks:
+        return _joined(first, tuple(_without_any(_certain(first), others)))
     kept = []
     for each in _certain(first):
         shared = sum(int(other.mask[each.indices].sum()) for other in others)
         if shared <= _WHOLE * len(each) and not any(same(each, other) for other in others):
             kept.append(each - second if shared else each)
     return _joined(first, tuple(kept))
+
+
+def _without_any(things: list[Selection], parts: list[Selection]) -> list[Selection]:
+    """The things that have none of some parts; each part is that of the nearest thing."""
+    having = {
+        int(np.argmin([np.linalg.norm(each.center - part.center) for each in things]))
+        for part in parts
+        if things
+    }
+    return [each for number, each in enumerate(things) if number not in having]
 
 
 def _pick(phrase: Pick, searched: Searched) -> Selection:

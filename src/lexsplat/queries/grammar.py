@@ -54,6 +54,7 @@ from lexsplat.queries.phrases import (
     Together,
     Understood,
     Viewer,
+    among,
     has_stray_viewer,
     in_place_of,
     loosened,
@@ -87,6 +88,8 @@ from lexsplat.queries.wording import (
     in_own_letters,
     is_place,
     is_quality,
+    lacking,
+    names_things,
     number,
     own_words,
     picked,
@@ -227,6 +230,8 @@ class _Parser:
             if not patterns.RELATION.search(f" {words} "[found.start() :]) and is_quality(rest):
                 if (pick := self.picked(noun, rest, found[1], deeper)) is not None:
                     return pick
+                if names_things(rest):
+                    return among(self.phrase(noun, deeper), self.phrase(rest, deeper), not found[1])
                 described = self.phrase(f"{rest} {noun}", deeper)
                 return Except(self.phrase(noun, deeper), described) if found[1] else described
         for split in (self.difference, self.union):
@@ -254,17 +259,15 @@ class _Parser:
             return self.phrase(f"{parts[0]} and {parts[1]}", depth)
         if patterns.ONLY.match(parts[1]):
             raise _IncompleteError(parts[1].split()[0])
-        if parts[1].strip().lower() in ("one", "two"):  # the largest but one
+        if (named := parts[0].strip()) and parts[1].strip().lower() in ("one", "two"):  # the largest but one
             return Thing(words)
-        named = parts[0].strip()
         first = Anything() if not named or patterns.ALL.match(named) else self.phrase(named, depth)
+        if lacks := lacking(first, words, parts[1]):
+            return lacks
         second = self.phrase(patterns.AND_NOT.sub(" and ", parts[1]), depth)
-        if (
-            isinstance(second, Pick)
-            and second.target == Anything()
-            and not patterns.NAMES_THINGS.search(parts[1])
-        ):
-            second = replace(second, target=first)
+        bare = second if isinstance(second, Pick) and second.target == Anything() else None
+        if bare and not patterns.NAMES_THINGS.search(parts[1]):
+            second = replace(bare, target=first)
         return without(first, second) or Except(first, second)
 
     def union(self, words: str, depth: int) -> Phrase | None:
@@ -333,6 +336,8 @@ class _Parser:
             if not quantity and (found := patterns.QUANTITY.match(bare)):
                 quantity, bare = number(found["number"]) + bool(found["more"]), bare[found.end() :]
                 exact = bool(found["exact"])
+                if not quantity:
+                    raise _IncompleteError(found["number"])
             bare = patterns.DETERMINER.sub("", bare)
         if quantity > 1 or rank or exact:
             asides = re.match(r"(?:from|to|on|at)\s", bare, re.IGNORECASE)

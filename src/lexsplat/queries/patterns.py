@@ -139,7 +139,7 @@ QUANTITY = re.compile(
     rf"^(?P<more>more than |over )?(?:at least )?(?P<exact>(?:exactly|precisely|only|just) )?"
     rf"(?P<number>\d{{1,3}}|{'|'.join(NUMBERS)}|both|several|multiple|many|"
     r"a few|a couple of|a pair of(?! (?:scissors|glasses|trousers|pants|jeans|shorts|binoculars|headphones|pliers|"
-    r"tongs)\b))"
+    r"tongs)\b))(?: or more)?"
     r"\s+(?!(?:meters?|metres?|centimeters?|inch(?:es)?|feet|yards?|steps?|cm|mm|m)\b)(?:of\s+)?",
     re.IGNORECASE,
 )

@@ -141,13 +141,14 @@ class Together:
 
 @dataclass(frozen=True)
 class Except:
-    """The first phrase without the second."""
+    """The first phrase without the second, or (``lacks``) what of the first has nothing of the second in it."""
 
     first: Phrase
     second: Phrase
+    lacks: bool = False
 
     def __str__(self) -> str:
-        return f"({self.first} minus {self.second})"
+        return f"({self.first} {'without' if self.lacks else 'minus'} {self.second})"
 
 
 @dataclass(frozen=True)
@@ -243,6 +244,13 @@ def without(phrase: Phrase, other: Phrase) -> Phrase | None:
             inner = Except(phrase.target, other)
         return None if inner is None else replace(phrase, target=inner)
     return None
+
+
+def among(phrase: Phrase, other: Phrase, inside: bool) -> Phrase:
+    """What a phrase names, of that only what another one names, too (``inside``), or all but that."""
+    if phrase == Anything() and inside:
+        return other
+    return Except(phrase, Except(phrase, other) if inside else other)
 
 
 def placed(place: Phrase, target: Phrase) -> Phrase:

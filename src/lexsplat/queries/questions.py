@@ -8,7 +8,7 @@ from functools import lru_cache
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.leftovers import NUMBERS, ORDINALS, left_over
 from lexsplat.queries.spelling import frame_errors
-from lexsplat.queries.vocabulary import COLORS, NAMES, PARTS, QUALITIES, default_vocabulary
+from lexsplat.queries.vocabulary import COLORS, NAMES, PARTS, QUALITIES, STATES, default_vocabulary
 
 _I = r"(?:i|we|you|one|someone|somebody|anyone|anybody|they|he|she|it)"
 _CAN = r"(?:can|could|would|will|may|might|should|do|did|does)"
@@ -81,8 +81,32 @@ _HAS_PART = re.compile(
     re.IGNORECASE,
 )
 """Whether a thing has a part: "does the mug have a handle" asks for the mug handle."""
+_HAS_PARTS = re.compile(
+    rf"^how many ((?:{'|'.join(sorted(PARTS))})(?:e?s)?) (?:does|do) (?:(?:the|an?|my|your|this|that) )?"
+    rf"((?:[\w-]+ ){{0,2}}(?:{'|'.join(sorted(NAMES))})s?) have$",
+    re.IGNORECASE,
+)
+"""How many parts a thing has: "how many wheels does the car have" counts the car wheels."""
 _REWORDED = (
     (_HAS_PART, r"\1 \2"),
+    (_HAS_PARTS, r"how many \2 \1"),
+    (re.compile(rf"\b(\d+|{'|'.join(NUMBERS)}) or more (?=\w)", re.IGNORECASE), r"at least \1 "),
+    (re.compile(r"^(what|which \w+) can be (?:seen|found|spotted) (?=\w)", re.IGNORECASE), r"\1 is "),
+    (re.compile(r"^what supports (?=(?:the|a|an|my|this|that) )", re.IGNORECASE), "what is under "),
+    (
+        re.compile(
+            r"^(where (?:is|are) .+) (?:standing|sitting|lying|located|placed|positioned|hanging)$",
+            re.IGNORECASE,
+        ),
+        r"\1",
+    ),
+    (
+        re.compile(
+            r"^(?:is|are) (.+) and (.+) ((?:right )?(?:next|close) to|near|beside) (?:each other|one another)$",
+            re.IGNORECASE,
+        ),
+        r"is \1 \3 \2",
+    ),
     (_OF_ITS_THING, r"\2 \1"),
     (_NEGATIVE, r"\1 "),
     (re.compile(r"\b(everything|anything|nothing|all)( else)? besides\b", re.IGNORECASE), r"\1 except"),
@@ -205,10 +229,7 @@ _LAST_QUALITIES = re.compile(
     rf"^(.+?) ({_ADJECTIVE}(?:(?:,? and |,? or |, ?| ){_ADJECTIVE})*)$", re.IGNORECASE
 )
 _ARTICLES = re.compile(r"^(?:(?:the|a|an|my|this|that|these|those|your|all|every|each|of) )+", re.IGNORECASE)
-_STATE = re.compile(
-    r"(?<! than)\b(open|closed|empty|full|broken|wet|dry|dirty|clean|old|new)$",
-    re.IGNORECASE,
-)
+_STATE = re.compile(rf"(?<! than)\b({'|'.join(sorted(STATES))})$", re.IGNORECASE)
 _COUNTED_TAIL = re.compile(
     rf"\s(?:(?:is|are|do|can|could|did|does|would)(?: {_I}| there)?(?: (?:see|find|count|have|spot|get|exist|visible|present|detect))?|exist)$",
     re.IGNORECASE,

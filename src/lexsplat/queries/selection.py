@@ -305,6 +305,7 @@ class Selection:
             "gaussians": self.num_gaussians,
             "threshold": round(float(self.threshold), 4),
             "best_view": self._shown_in if instances else "",
+            "note": self.note,
             "instances": [instance.geometry() for instance in instances],
         }
 

@@ -23,8 +23,12 @@ _COLORS = """
 _QUALITIES = """
     grey, golden, copper, wooden, metal, metallic, ceramic, glass, rubber, plastic, wax, paper, stone, brick,
     striped, checkered, plain, painted, shiny, soft, fluffy, leafy, tiled, potted, burning, round, square, flat,
-    big, small, large, little, tall, open, closed, empty, full, broken, wet, dry, old, new, dark, bright,
-    transparent, colorful, dirty, clean
+    big, small, large, little, tall, dark, bright, transparent, colorful
+"""
+_STATES = """
+    open, closed, empty, full, broken, wet, dry, dirty, clean, old, new, dead, alive, lit, ripe, unripe, rotten,
+    fresh, hot, cold, warm, heavy, cute, happy, sad, expensive, cheap, real, fake, edible, fragile, rusty, dusty,
+    asleep, awake, frozen, melted, safe, dangerous, comfortable, useful
 """
 _PARTS = """
     handle, lid, cap, spout, neck, rim, knob, stem, stalk, leaf, petal, shade, cord, string, flame, wick, cork,
@@ -55,7 +59,9 @@ PARTS = frozenset(words(_PARTS))
 """Nouns that name a part behind its thing, which compounds such as "candle holder" do not."""
 COLORS = frozenset(words(_COLORS))
 """Words of colors."""
-QUALITIES = frozenset(words(_QUALITIES)) | COLORS
+STATES = frozenset(words(_STATES))
+"""Adjectives that photos may not tell."""
+QUALITIES = frozenset(words(_QUALITIES)) | COLORS | STATES
 """Adjectives that may follow their noun: "is the mug red", "vase, white"."""
 
 

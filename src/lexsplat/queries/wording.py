@@ -8,8 +8,9 @@ from lexsplat.queries import patterns
 from lexsplat.queries.colors import COLOR_WORDS
 from lexsplat.queries.kinds import is_kind
 from lexsplat.queries.leftovers import NUMBERS, ORDINALS, left_over
-from lexsplat.queries.phrases import Anything, Colored, Phrase, PickName, Thing
-from lexsplat.queries.vocabulary import COLORS, QUALITIES
+from lexsplat.queries.phrases import Anything, Colored, Except, Phrase, PickName, Thing
+from lexsplat.queries.spelling import singular
+from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, is_part_alone
 
 
 def own_words(left: str, plain: str) -> str:
@@ -89,6 +90,20 @@ def is_quality(words: str) -> bool:
         and not names
         and not patterns.NEAR_ME.match(f"x {words}")
     )
+
+
+def names_things(words: str) -> bool:
+    """Whether words behind "that are" name things: "toys", "red cars"."""
+    last = words.lower().split()[-1]
+    return last not in QUALITIES and (singular(last) in NAMES or is_kind(singular(last)))
+
+
+def lacking(first: Phrase, words: str, rest: str) -> Phrase | None:
+    """ "Mug without handle": mugs that have none; None if ``rest`` is no part of a thing, or is only taken off."""
+    part = singular(undetermined(rest.strip()))
+    if not isinstance(first, Thing) or not is_part_alone(part) or " without " not in f" {words.lower()} ":
+        return None
+    return Except(first, Thing(f"{first.text} {part}"), lacks=True)
 
 
 def all_qualities(words: str) -> bool:

@@ -322,8 +322,7 @@ def find_phrase(
     """One entry of `find_phrases`."""
     understood = scene.understand(phrase)
     found = scene.find(phrase, view, threshold=threshold)
-    note = "; ".join(filter(None, (understood.note, found.note)))
-    return {**found.to_dict(), "phrase": phrase, "understood": str(understood.phrase), "note": note}
+    return {**found.to_dict(), "phrase": phrase, "understood": str(understood.phrase)}
 
 
 def default_views(scene: Scene) -> list[str]:

@@ -73,8 +73,11 @@ def find_in(
         understood: The phrase.
         camera: Camera that "left" and "me" refer to; None lets the views decide that show both things
             (`lexsplat.queries.viewers`), and takes the camera in the middle of all for "me".
-        threshold: See `Scene.select`. With an automatic threshold, an answer "no" has no Gaussians. The note names
-            the things that do not reach a given one.
+        threshold: See `Scene.select`. With an automatic threshold, an answer "no" has no Gaussians.
+
+    Returns:
+        The selection. Its note says what of the phrase was not understood, and which things do not reach a given
+        threshold.
     """
     things = things_of(understood.phrase)
     # A phrase is checked as a whole; words in quotation marks have no grammar.
@@ -92,8 +95,8 @@ def find_in(
     found = answer(understood.phrase, searched)
     if (present := understood.limit(found.present)) != found.present:
         found = found.described(present=present)
-    if answers is not None and threshold is not None:
-        found = found.described(note="; ".join(filter(None, (found.note, *_too_low(answers, threshold)))))
+    low = _too_low(answers, threshold) if answers is not None and threshold is not None else ()
+    found = found.described(note="; ".join(filter(None, (understood.note, found.note, *low))))
     if found.present == "no" and threshold is None:
         return replace(found, mask=torch.zeros_like(found.mask), parts=())
     return found

@@ -120,7 +120,7 @@ class Scene:
         self.__dict__.pop("kept", None)
         kept = max(32, min(1024, _KEPT_BYTES // (9 * max(1, len(self.gaussians)))))
         self._words: Bounded[str, Word] = Bounded(kept)
-        self._found: Bounded[tuple[str, bool, str | None, float | None], Selection] = Bounded(kept)
+        self._found: Bounded[tuple[str, str | None, float | None], Selection] = Bounded(kept)
         self._understood: Bounded[str, Understood] = Bounded(_KEPT_TEXTS)
 
     def with_content(self, gaussians: Gaussians, field: LanguageField) -> Scene:
@@ -305,7 +305,7 @@ class Scene:
         if isinstance(view, Camera):
             return find_in(self, understood, camera, threshold)
         name = None if view is None else (view if isinstance(view, StoredView) else self.view(view)).name
-        key = (repr(understood.phrase), understood.unknown, name, threshold)
+        key = (repr(understood), name, threshold)
         return self._found.get_or_make(key, lambda: find_in(self, understood, camera, threshold))
 
     def understand(self, phrase: str) -> Understood:

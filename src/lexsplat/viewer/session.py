@@ -117,10 +117,9 @@ class Session:
         plain = understood.phrase == Thing(asked.prompt)
         if asked.threshold is None:
             self.history.add(asked.prompt)
-        note = "; ".join(filter(None, (understood.note, selection.note)))
         notes = {
             "understood": "" if plain else str(understood.phrase),
-            "note": note,
+            "note": selection.note,
             "unknown": understood.unknown,
         }
         return self._reply(selection, notes)
