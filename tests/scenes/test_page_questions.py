@@ -22,7 +22,8 @@ SINGLE = (
     "show me the mug, please", "mug, duck and banana", "the handle of that blue mug", '"red apple"', "vase, white",
     'the "red apple" and the duck', "is there a zebra or a duck?", "is there a zebra and a duck?", "pink things",
     "red toy", "orange fruit", "yellow fruit", "blue toy", "something with leaves", "things with leaves",
-    "can you see the mug?", "How many books?", "zebra", "red apple",
+    "can you see the mug?", "How many books?", "zebra", "red apple", "handle", "which things are toys?",
+    "is the plant dead?", "where is the duck standing?", "how many wheels does the car have?", "things that are animals",
 )  # fmt: skip
 FURTHER = (
     "banana next to the apple", "apple on the table", "what is on the table?", "the biggest toy", "the largest fruit",
@@ -32,7 +33,8 @@ FURTHER = (
     "not the mug", "second toy from the left", "mug between the duck and the apple", "all fruit except the banana",
     "the toy in the back left corner", "is the mug on the table?", "are all toys red?", "the thing closest to me",
     "small table", "large lamp", "all except the books", "all but the apple",
-    "mug that is not blue", "book that is larger than the mug",
+    "mug that is not blue", "book that is larger than the mug", "fruits that are not apples",
+    "toys that are animals", "things that are not toys",
 )  # fmt: skip
 """What needs relations, an order, a comparison, a number or an exception."""
 ASK = """async (prompts) => {

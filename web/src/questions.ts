@@ -114,6 +114,11 @@ class Parser {
       const noun = grammar.undetermined(` ${words}`.slice(0, quality.index).trim());
       if (quality[1]) this.#beyond("not");
       if (grammar.match("pick", noun) || grammar.match("extreme", noun)) this.#beyond(noun.split(" ")[0]);
+      if (!quality[1] && this.#namesThings(quality[2])) {
+        if (grammar.match("thing_word", noun)) return this.#phrase(quality[2]);
+        this.#beyond(quality[0].trim().split(" ").slice(0, 2).join(" "));
+        return [...this.#phrase(noun), ...this.#phrase(quality[2])];
+      }
       return this.#phrase(quality[1] ? noun : `${quality[2]} ${noun}`);
     }
     return this.#difference(words) ?? this.#union(words) ?? this.#one(words);
@@ -124,6 +129,12 @@ class Parser {
     const parts = words.toLowerCase().split(" ");
     const picks = this.grammar.match("pick", parts.at(-1)!);
     return parts.length <= 3 && !["the", "a", "an", "made", "built", "not"].includes(parts[0]) && !picks && !this.grammar.match("near_me", `x ${words}`);
+  }
+
+  /** Whether words behind "that are" name things: "toys", "red cars". */
+  #namesThings(words: string): boolean {
+    const last = words.toLowerCase().split(" ").at(-1)!;
+    return !this.grammar.has("qualities", last) && singulars(last).some((form) => this.grammar.has("names", form) || this.grammar.has("kinds", form));
   }
 
   #difference(words: string): Thing[] | null {

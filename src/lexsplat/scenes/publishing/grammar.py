@@ -8,7 +8,7 @@ from typing import Any
 from lexsplat.queries import leftovers, patterns, questions
 from lexsplat.queries.colors import COLOR_WORDS
 from lexsplat.queries.kinds import KIND_PHRASES
-from lexsplat.queries.vocabulary import COLORS, QUALITIES
+from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES
 
 _OF_THE_GRAMMAR = (
     "RELATION", "BETWEEN", "CORNER", "PART", "ASIDE", "NEAR_ME", "MY_SIDE", "DETERMINER", "THE_ONE", "EXCEPT", "NOT",
@@ -42,6 +42,7 @@ def page_grammar() -> dict[str, Any]:
             "qualities": sorted(QUALITIES),
             "patterns": sorted(patterns.PATTERNS),
             "kinds": list(KIND_PHRASES),
+            "names": sorted(NAMES),
         },
         "materials": patterns.MATERIAL,
     }
