@@ -34,9 +34,9 @@ def codes_of(masses) -> SegmentCodes:
     return SegmentCodes(numbers, torch.zeros(7, 1), np.array(whole, float))
 
 
-def wholes(strengths, masses=(1, 1, 1, 1, 1)):
+def wholes(strengths, masses=(1, 1, 1, 1, 1), materials=(False, False, False, False)):
     table = np.array(strengths, float)
-    return whole_segments(codes_of(masses), lambda part: table[:, part], table.shape[1])
+    return whole_segments(codes_of(masses), lambda part: table[:, part], materials[: table.shape[1]])
 
 
 def test_the_coarsest_segment_that_a_name_describes_with_its_parts_is_an_object():
@@ -52,6 +52,14 @@ def test_a_segment_of_two_things_is_divided():
     strengths = [[0.9, 0.1], [0.1, 0.9], [0.1, 0.1], [0.9, 0.1], [0.1, 0.4], [0.7, 0.2], [0.7, 0.2]]
     assert wholes(strengths).places.tolist() == [0, 1, -1, 3, -1]
     assert wholes(strengths, (9, 1, 1, 9, 1)).places.tolist() == [5, 5, -1, 6, 6], "by what the views show"
+
+
+def test_what_is_of_metal_is_named_by_what_it_is_where_a_name_fits():
+    #            ring metal
+    strengths = [[0.7, 0.9], [0.7, 0.9], [0.1, 0.9], [0.1, 0.1], [0.5, 0.9], [0.7, 0.9], [0.1, 0.1]]
+    found = wholes(strengths, materials=(False, True))
+    assert found.places.tolist() == [5, 5, 2, -1, 4]
+    assert found.words[[5, 2, 4]].tolist() == [0, 1, 1]
 
 
 def test_probabilities_of_names_leave_a_rest_for_other_names():

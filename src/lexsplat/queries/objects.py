@@ -9,7 +9,7 @@ Dimension letters: W words of the vocabulary, V segments of all levels, S lowest
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -45,19 +45,33 @@ class WholeSegments(NamedTuple):
     words: IntArray
 
 
-def whole_segments(codes: SegmentCodes, strengths: Strengths, words: int) -> WholeSegments:
+def whole_segments(
+    codes: SegmentCodes, strengths: Strengths, materials: Sequence[bool] | NDArray[np.bool_]
+) -> WholeSegments:
     """The segments that one word describes as a whole, from the coarsest level down.
 
     Args:
         codes: The segments of all levels.
         strengths: Function from a slice of the words to their strengths at each segment.
-        words: Number of words W.
+        materials: Which of the words name materials ``[W]``: a ring of metal is a ring if that word fits, too.
     """
-    best, most = np.zeros(len(codes.masses), np.int64), np.full(len(codes.masses), -np.inf)
-    for start in range(0, words, _WORDS):
-        found = strengths(slice(start, min(start + _WORDS, words)))
-        better = found.max(1) > most
-        best[better], most[better] = start + found.argmax(1)[better], found.max(1)[better]
+    shape, is_material = (2, len(codes.masses)), np.asarray(materials, bool)
+    ranked, heights = np.zeros(shape, np.int64), np.full(shape, -np.inf)
+    for start in range(0, len(is_material), _WORDS):
+        part = slice(start, min(start + _WORDS, len(is_material)))
+        strong = strengths(part)
+        for kind in (0, 1):
+            found = np.where(is_material[part] == kind, strong, -np.inf)
+            better = found.max(1) > heights[kind]
+            ranked[kind, better], heights[kind, better] = (
+                start + found.argmax(1)[better],
+                found.max(1)[better],
+            )
+    of_material = (heights[1] > heights[0]) & (heights[0] < FITS)
+    best, most = (
+        np.where(of_material, ranked[::-1], ranked)[0],
+        np.where(of_material, heights[::-1], heights)[0],
+    )
     places, lowest = np.full(codes.numbers.shape[1], -1), codes.numbers[0]
     fitting = {int(word): strengths(slice(int(word), int(word) + 1))[:, 0] for word in np.unique(best)}
     for level in codes.numbers[::-1]:

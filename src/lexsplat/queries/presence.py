@@ -199,7 +199,7 @@ class PresenceClassifier:
             return DescribedPlaces(torch.zeros(0, len(self.language.codebook.clip)), ())
         texts = self._embed(words)
         whole = whole_segments(
-            codes, lambda part: self.strengths(texts[part], codes.distributions), len(words)
+            codes, lambda part: self.strengths(texts[part], codes.distributions), [False] * len(words)
         )
         # What no word describes takes part with its lowest segments.
         places = np.unique(np.where(whole.places < 0, codes.numbers[0], whole.places))

@@ -48,6 +48,8 @@ def words(text: str) -> list[str]:
 
 SURFACES = frozenset(words(_SURFACES))
 """Names of surfaces, materials and parts: none of them is a "thing" when everything is asked for."""
+MATERIALS = frozenset({"wood", "metal", "plastic", "stone", "brick"})
+"""Names of materials, which give way to the name of a thing."""
 STUFF = frozenset({"wall", "floor", "ceiling", "ground", "road", "sky", "water", "grass", "sand", "carpet"})
 """Names of surfaces that are one, however the things in front of them divide what can be seen of them."""
 NAMES = frozenset(entry.split(" of ")[0].split()[-1] for entry in words(_EVERYDAY) + words(_BUNDLED)) - {

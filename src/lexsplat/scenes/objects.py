@@ -16,7 +16,7 @@ from lexsplat.queries.objects import name_probabilities, whole_segments
 from lexsplat.queries.relations import same
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary
+from lexsplat.queries.vocabulary import MATERIALS, STUFF, SURFACES, default_vocabulary
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.answers import rests_on
@@ -32,6 +32,8 @@ _MAX_BYTES = 1 << 20
 _MAX_LENGTH = 120
 _NAMES = 3
 _LEAST_PROBABILITY = 0.01
+_FAR_BETTER = 0.5
+"""Share of the likeliest name's probability below which an object's own name gives way to it."""
 _TILE = (200, 150)
 _LINE = 16
 _COLUMNS = 5
@@ -99,7 +101,9 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     if codes is None:
         return ()
     whole = whole_segments(
-        codes, lambda part: classifier.strengths(texts[part], codes.distributions), len(words)
+        codes,
+        lambda part: classifier.strengths(texts[part], codes.distributions),
+        [w in MATERIALS for w in words],
     )
     named = torch.from_numpy(np.where(whole.places < 0, -1, whole.words[whole.places])).to(segments.labels)
     found: list[Selection] = []
@@ -170,11 +174,18 @@ def _entry(scene: Scene, thing: Selection) -> dict[str, Any]:
 
 
 def _named(thing: Selection, words: Sequence[str], strengths: np.ndarray) -> Selection:
-    """An object with its likeliest names, its own name first; the strength of that name becomes its scores."""
+    """An object with its likeliest names, its own name first; the strength of that name becomes its scores.
+
+    Its own name describes it and its parts, unless another one describes all of it far better.
+    """
+    own = words.index(thing.phrase)
+    if words[own] not in MATERIALS:  # nothing is only of metal
+        strengths = np.where([word in MATERIALS for word in words], -np.inf, strengths)
     shares = name_probabilities(strengths)
     order = np.argsort(-shares, kind="stable")[:_NAMES]
     names = [(words[place], float(shares[place])) for place in order if shares[place] >= _LEAST_PROBABILITY]
-    own = words.index(thing.phrase)
+    if names and shares[own] < _FAR_BETTER * names[0][1]:
+        thing, own = thing.described(phrase=names[0][0]), int(order[0])
     if thing.phrase != (names or [("", 0.0)])[0][0]:
         names = [(thing.phrase, float(shares[own])), *(entry for entry in names if entry[0] != thing.phrase)]
     strength = min(max(float(strengths[own]), 0.0), 1.0)
