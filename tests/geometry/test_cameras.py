@@ -124,7 +124,7 @@ def test_whole_sizes_of_any_type_become_int(kind):
     assert (camera.width, camera.height) == (64, 48)
 
 
-@pytest.mark.parametrize("fov_y", [46, 0, -0.5, np.pi, np.nan])
+@pytest.mark.parametrize("fov_y", [46, 0, -0.5, np.pi, np.nan, "0.8"])
 def test_a_field_of_view_beyond_half_a_turn_is_refused(fov_y):
     with pytest.raises(ValueError, match=r"fov_y: expected .*radians"):
         look_at([0, 0, 0], [0, 0, 1], [0, -1, 0], 64, 48, fov_y)

@@ -141,10 +141,9 @@ def look_at(position: NDArray, target: NDArray, up: NDArray, width: int, height:
         ValueError: If the field of view is outside its range, the target is at the position, or the directions are
             parallel; see also `Camera`.
     """
-    if not 0 < fov_y < np.pi:
-        raise ValueError(
-            f"fov_y: expected radians above 0 and below pi, found {fov_y:g}; convert degrees with math.radians"
-        )
+    if not (isinstance(fov_y, Real) and 0 < fov_y < np.pi):
+        remedy = "convert degrees with math.radians"
+        raise ValueError(f"fov_y: expected radians above 0 and below pi, found {fov_y!r:.40}; {remedy}")
     if np.array_equal(position, target):
         raise ValueError(
             f"position and target: expected two points, found {np.asarray(target).tolist()} twice; move one"
