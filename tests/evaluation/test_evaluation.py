@@ -122,12 +122,12 @@ def larger_masks(capture, scale):
     return masks
 
 
-@pytest.mark.parametrize("form", ["feature", "code"])
-def test_a_field_that_knows_the_truth_scores_one_everywhere(capture, gaussians, form):
+@pytest.mark.parametrize(("asked", "used"), [("feature", "feature"), ("code", "code"), ("segment", "code")])
+def test_a_field_that_knows_the_truth_scores_one_everywhere(capture, gaussians, asked, used):
     scene = traced(capture, gaussians)
-    scene.query = QueryConfig(form=form)
+    scene.query = QueryConfig(form=asked)
     language = evaluate(capture, scene, QUICK).language
-    assert language["form"] == form
+    assert language["form"] == used, "the field has no segments"
     strict = language["strict"]
     for kind in ("auto", "fixed", "oracle"):
         assert strict[kind] == pytest.approx({"mIoU": 1, "mPA": 1, "mP": 1}), kind
@@ -396,7 +396,7 @@ def test_lerf_3d_scores_what_is_selected_in_space_and_any_method_can_be_measured
     dense = gaussians_from_points(capture.points, capture.point_colors, sh_degree=0, opacity=0.95)
     config = replace(QUICK, protocols=("strict", "lerf-3d"))
     language = evaluate(capture, painted_scene(capture, dense, PaintedMethod(dense)), config).language
-    assert language["method"] == "painted"
+    assert (language["method"], language["form"]) == ("painted", "feature")
     assert language["strict"]["auto"]["mIoU"] == 1
     assert 0.4 < language["lerf_3d"]["mIoU"] < 1, "the silhouette of sparse points is ragged"
     assert "official" not in language

@@ -97,6 +97,12 @@ def test_what_the_light_tower_does_not_know_is_left_to_transformers(clip_folder,
     assert refused(vocab_size=999)
 
 
+@pytest.mark.parametrize("load", [load_text, load_clip])
+def test_a_character_of_several_bytes_may_be_several_tokens(load):
+    # None of them is a word of the bundled model: 20 times 3 bytes, start and end, of which 24 tokens are read.
+    assert load("bundled").tokens_over("红" * 20) == 62 - 24
+
+
 def test_a_text_tower_that_is_not_whole_is_refused(clip_folder, tmp_path):
     copy = shutil.copytree(clip_folder, tmp_path / "copy")
     state = load_file(copy / "model.safetensors")

@@ -92,8 +92,52 @@ def test_extent_is_the_radius_times_1_1_and_1_for_a_point():
         ({"K": np.diag([np.inf, 1, 1])}, "NaN or infinity"),
         ({"width": 0}, "image size"),
         ({"K": np.diag([-1.0, 1, 1])}, "focal"),
+        ({"K": np.diag([1.0, 1, 2])}, "K must be"),
+        ({"K": np.eye(3) + 0.01 * np.eye(3, k=1)}, "K must be"),  # skew
+        ({"K": K.T}, "K must be"),
+        ({"viewmat": np.zeros((4, 4))}, "rotation"),
+        ({"viewmat": np.diag([2.0, 2, 2, 1])}, "rotation"),
+        ({"viewmat": np.diag([-1.0, 1, 1, 1])}, "rotation"),  # a mirror
+        ({"viewmat": np.eye(4)[[1, 0, 2, 3]]}, "rotation"),  # a mirror
+        ({"viewmat": np.eye(4) + np.eye(4, k=-3)}, "row"),
+        ({"width": "320"}, "whole"),
+        ({"height": 240.5}, "whole"),
+        ({"height": np.inf}, "whole"),
+        ({"height": None}, "whole"),
     ],
 )
 def test_invalid_cameras_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         Camera(**{"width": 4, "height": 4, "K": np.eye(3), "viewmat": np.eye(4), **change})
+
+
+def test_poses_rounded_by_other_programs_are_accepted():
+    rounded = np.round(look_at([3, 1, 2], [0.5, 0, 0], [0, 0, 1], 64, 48, 0.9).viewmat, 4)
+    camera = Camera(64, 48, K + 1e-3 * np.eye(3, k=1), rounded)
+    assert camera.resized(6400, 4800).viewmat == pytest.approx(rounded)
+
+
+@pytest.mark.parametrize("kind", [float, np.float32, np.int64, np.uint16])
+def test_whole_sizes_of_any_type_become_int(kind):
+    camera = Camera(kind(64), kind(48), K, np.eye(4))
+    assert (type(camera.width), type(camera.height)) == (int, int)
+    assert (camera.width, camera.height) == (64, 48)
+
+
+@pytest.mark.parametrize("fov_y", [46, 0, -0.5, np.pi, np.nan, "0.8"])
+def test_a_field_of_view_beyond_half_a_turn_is_refused(fov_y):
+    with pytest.raises(ValueError, match=r"fov_y: expected .*radians"):
+        look_at([0, 0, 0], [0, 0, 1], [0, -1, 0], 64, 48, fov_y)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_viewing_direction_that_is_none_is_refused():
+    with pytest.raises(ValueError, match="position and target"):
+        look_at([1, 2, 3], [1, 2, 3], [0, 0, 1], 64, 48, 1.0)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -2), (0, 1e-9, 1), (0, 0, 0)])
+def test_an_up_direction_parallel_to_the_view_is_refused(up):
+    with pytest.raises(ValueError, match=r"up: expected .*parallel"):
+        look_at([1, 2, 3], [1, 2, 0], up, 64, 48, 1.0)

@@ -19,6 +19,7 @@ from lexsplat.pipeline import geometry
 from lexsplat.pipeline.build import STAGES, build
 from lexsplat.runtime.memory import parse_bytes
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.scene import open_scene
 
 pytestmark = pytest.mark.usefixtures("color_encoders")
 
@@ -77,6 +78,19 @@ def test_stages_are_those_of_the_method_and_a_second_build_keeps_all(
     assert record["stages"]["language"]["method"] == config.method
     copy = shutil.copytree(built_by_method / config.method, tmp_path / "copy")
     assert stages_run(tiny_capture, copy, config) == dict.fromkeys(expected, True)
+
+
+def test_a_scene_names_the_method_that_made_it_whatever_its_field_says(
+    built_by_method, tiny_capture, tmp_path, monkeypatch
+):
+    class Toy(Averaged):
+        name = "toy"
+
+    monkeypatch.setitem(METHODS, "toy", Toy())
+    copy = shutil.copytree(built_by_method / "averaged", tmp_path / "copy")
+    build(tiny_capture, copy, replace(AVERAGED, method="toy"))
+    scene = open_scene(copy, device="cpu")
+    assert scene.field.method == scene.folder.record["stages"]["language"]["method"] == "toy"
 
 
 @pytest.mark.slow

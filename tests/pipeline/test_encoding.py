@@ -1,18 +1,26 @@
 """The encoders of a build: loaded when used, once, and looked for before the work begins."""
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save_file
+from support.color_encoder import ColorClip
+from support.experiments import CONFIG
 
 from lexsplat.captures import load_capture
 from lexsplat.features import FeatureConfig
 from lexsplat.features.estimate import Estimate
+from lexsplat.features.hub import content_hash, model_folder
 from lexsplat.pipeline import encoding
+from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps
 from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.progress import NOTE
+from lexsplat.scenes.scene import open_scene
 
 
 def test_an_encoder_is_loaded_when_it_is_first_used_and_only_then(monkeypatch):
@@ -62,6 +70,26 @@ def test_encoders_may_be_on_a_gpu_beside_a_rasterizer_on_the_cpu(monkeypatch):
     assert (
         config.features.tokens == BuildConfig(clip="a", dino="b").resolved("cuda", (96, 72)).features.tokens
     )
+
+
+def test_a_family_of_encoders_in_model_folders_needs_its_loader_alone(tiny_capture, tmp_path, monkeypatch):
+    folder = tmp_path / "toy"
+    folder.mkdir()
+    for name, content in (("config.json", '{"model_type": "toy"}'), ("tokenizer.json", "{}")):
+        (folder / name).write_text(content)
+    save_file({"weight": torch.zeros(1)}, folder / "model.safetensors")
+
+    def load(name, *_):
+        toy = ColorClip()
+        toy.content_hash = content_hash(model_folder(name, "clip"), "clip")
+        return toy
+
+    monkeypatch.setattr("lexsplat.features.encoders.load_clip", load)
+    config = replace(CONFIG, clip=str(folder), dino="none", method="averaged", iterations=4)
+    build(tiny_capture, tmp_path / "scene", config)
+    moved = shutil.copytree(folder, tmp_path / "moved")
+    scene = open_scene(tmp_path / "scene", device="cpu", clip=str(moved))
+    assert scene.embed("red apple").tolist() == ColorClip().encode_text(["red apple"]).tolist()
 
 
 @pytest.mark.gpu

@@ -62,3 +62,6 @@ def test_a_click_that_hits_nothing_is_refused(balls):
         surface_at(balls.gaussians, camera, 20.0, 15.0)
     with pytest.raises(QueryError, match="outside"):
         surface_at(balls.gaussians, camera, 41.0, 15.0)
+    for pixel in (("20", 15.0), (20.0, None), (np.nan, 15.0)):
+        with pytest.raises(QueryError, match="a pixel of a 40x30 image"):
+            surface_at(balls.gaussians, camera, *pixel)

@@ -142,6 +142,14 @@ def test_masks_of_another_scene_are_refused(balls):
             combine(ball(balls, 0), other)
 
 
+def test_a_selection_combines_with_selections_only(balls):
+    for combine in (operator.or_, operator.and_, operator.sub):
+        with pytest.raises(TypeError, match="unsupported operand"):
+            combine(ball(balls, 0), 5)
+        with pytest.raises(TypeError, match="unsupported operand"):
+            combine("mug", ball(balls, 0))
+
+
 def test_plain_data_counts_instances_and_lists_none_of_what_is_not_there(balls):
     there = select(balls, np.isin(balls.labels, (0, 1)), phrase="ball").to_dict()
     assert (there["count"], len(there["instances"]), there["gaussians"]) == (2, 2, 400)

@@ -10,6 +10,7 @@ from support.schemas import validated
 
 from lexsplat import cli, open_scene
 from lexsplat.runtime.errors import LibraryError
+from lexsplat.runtime.files import read_json, write_json
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.library import Library
 
@@ -58,6 +59,18 @@ def test_an_encoder_without_a_hit_that_does_not_know_a_word_is_reported(tmp_path
     assert [hit.scene for hit in found.hits] == ["office"]
     unknown = 'the bundled encoder knows English words alone, not "🍎🦆"'
     assert found.note == f'nothing fits "🍎🦆"; {unknown}'
+
+
+def test_an_encoder_of_two_names_counts_as_one_encoder(tmp_path):
+    library = Library.create(tmp_path / "library")
+    for room, clip in (("office", "models/abc"), ("kitchen", "elsewhere/abc")):
+        path = write_scene(tmp_path / room) / "scene.json"
+        write_json(path, {**read_json(path), "config": {"clip": clip}})
+        library.add(path.parent)
+    assert {record.clip for record in library.records()} == {"models/abc", "elsewhere/abc"}
+    found = library.search("dog")
+    assert len(found.encoders) == len(library.groups()) == 1
+    assert "in 0 of 2 scenes (" in repr(found)
 
 
 def test_a_note_that_holds_for_some_scenes_alone_names_them(two_rooms):

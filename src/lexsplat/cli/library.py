@@ -77,7 +77,13 @@ class LibraryCommand:
     def check(self) -> None:
         """Refuse invalid options."""
         if self.action == "search":
-            check_phrases(() if any(not word.strip() for word in self.words) else self.words)
+            check_phrases(self.words)
+            for number, word in enumerate(self.words, start=1):
+                if not word.strip():
+                    raise ValueError(
+                        f"PHRASE {number} of {len(self.words)}: expected a word or phrase, found an empty text; "
+                        'name something, such as "red apple"'
+                    )
         if self.action in ("add", "remove") and not self.words:
             raise ValueError("at least one SCENE is needed")
         if self.action in ("list", "verify") and self.words:

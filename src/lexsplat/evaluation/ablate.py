@@ -182,4 +182,5 @@ def make_language(
     scratch = bench.folder.root / "checkpoints"
     run = FitRun(seed=config.seed, memory=config.memory_bytes, scratch=scratch, listener=bench.listener)
     field = method.fit(bench.gaussians, views, config, run)
+    field.method = method.name
     return field, {**seconds, "language": time.perf_counter() - start}

@@ -41,6 +41,7 @@ from lexsplat.evaluation.results import Metrics, PairResult, ViewImages
 from lexsplat.evaluation.summary import mean_of, precision_curves, summarize_kinds, summarize_language
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.queries.scoring import form_used
 from lexsplat.rendering import render
 from lexsplat.runtime.device import kernel_threads
 from lexsplat.runtime.progress import Event, Listener, silent
@@ -107,7 +108,9 @@ def evaluate(
     quality = run.run(observer, listener)
     words = summarize_language(run.pairs, run.thresholds)
     if words is not None:
-        words = {"form": scene.query.form, "method": scene.field.method, **words}
+        # Rebuilt methods compare features with the text, whatever form is asked for.
+        form = form_used(scene.field, scene.query) if isinstance(scene, Scene) else "feature"
+        words = {"form": form, "method": scene.field.method, **words}
         words["per_kind"] = summarize_kinds(run.pairs, run.thresholds, prompt_kinds or {})
     return Metrics(
         quality=quality,

@@ -182,8 +182,6 @@ class ClipEncoder(PretrainedModel):
 
     def tokens_over(self, prompt: str) -> int:
         """Number of tokens by which a prompt exceeds the limit of the model and is truncated."""
-        if len(prompt) + 2 <= self._text_length:  # a token but start and end has at least one character
-            return 0
         return max(len(self._tokenizer(prompt, verbose=False)["input_ids"]) - self._text_length, 0)
 
     def _pixels(self, images: Tensor) -> Tensor:

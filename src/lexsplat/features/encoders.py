@@ -61,7 +61,7 @@ class DenseEncoder(Protocol):
         """``[3, h, w]`` in 0..1 to ``[h', w', D]``, float32 on the CPU, unit length; see `DinoEncoder`."""
 
 
-def load_clip(name: str = DEFAULT_CLIP, device: torch.device | str = "cpu") -> ClipEncoder:
+def load_clip(name: str = DEFAULT_CLIP, device: torch.device | str = "cpu") -> ImageTextEncoder:
     """A CLIP-like encoder by name, folder, or "bundled".
 
     Raises:
@@ -70,7 +70,7 @@ def load_clip(name: str = DEFAULT_CLIP, device: torch.device | str = "cpu") -> C
     return ClipEncoder(model_folder(name, "clip"), name, device)
 
 
-def load_dino(name: str = DEFAULT_DINO, device: torch.device | str = "cpu") -> DinoEncoder:
+def load_dino(name: str = DEFAULT_DINO, device: torch.device | str = "cpu") -> DenseEncoder:
     """A DINO-like encoder by name, folder, or "bundled".
 
     Raises:

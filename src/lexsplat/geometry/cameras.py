@@ -8,14 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lexsplat.geometry.rotations import looking_along
+from lexsplat.geometry.rotations import is_rotation, looking_along
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Flips the y and z axes of the camera: OpenGL looks along -z with y up, OpenCV along +z with y down."""
+
+_ROUNDING = 1e-3
+"""Largest error of an entry that is constant in every camera, since other programs write few digits."""
+_LAST = np.eye(4)[3]
 
 
 @dataclass(frozen=True, repr=False)
@@ -23,13 +28,14 @@ class Camera:
     """A pinhole camera without distortion.
 
     Args:
-        width: Image width in pixels.
-        height: Image height in pixels.
-        K: Intrinsics ``[3, 3]`` in pixels, float64.
-        viewmat: World to camera ``[4, 4]``, OpenCV axes, float64.
+        width: Image width in pixels, a whole number of any type.
+        height: Image height in pixels, likewise.
+        K: Intrinsics ``[3, 3]`` in pixels, float64: focal lengths and the principal point, without skew.
+        viewmat: World to camera ``[4, 4]``, OpenCV axes, float64: a rotation and a translation.
 
     Raises:
-        ValueError: If a shape is wrong, a value is NaN or infinite, or a size or focal length is not positive.
+        ValueError: If a shape is wrong, a value is NaN or infinite, a size or focal length is not positive, or a
+            matrix is of another form; errors of 0.001, as from rounding, are accepted.
     """
 
     width: int
@@ -38,6 +44,8 @@ class Camera:
     viewmat: NDArray[np.float64]
 
     def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            object.__setattr__(self, name, _whole(name, getattr(self, name)))
         object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64))
         object.__setattr__(self, "viewmat", np.asarray(self.viewmat, dtype=np.float64))
         if self.K.shape != (3, 3):
@@ -50,6 +58,21 @@ class Camera:
             raise ValueError(f"image size must be positive, got {self.width}x{self.height}")
         if self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
             raise ValueError(f"focal lengths must be positive, got {self.K[0, 0]:g}, {self.K[1, 1]:g}")
+        self._check_form()
+
+    def _check_form(self) -> None:
+        """Refuse matrices that are not those of a pinhole camera, of which rendering would ignore a part."""
+        (fx, skew, _), (tilt, fy, _), last = self.K.tolist()
+        if max(abs(skew) / fx, abs(tilt) / fy, *(abs(a - b) for a, b in zip(last, (0, 0, 1)))) > _ROUNDING:
+            form, remedy = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", "divide by K[2, 2] and leave out skew"
+            raise ValueError(f"K must be {form}, got {self.K.tolist()}; {remedy}")
+        turn, row = self.viewmat[:3, :3], self.viewmat[3]
+        if not is_rotation(turn, _ROUNDING):
+            found, remedy = f"a matrix of determinant {np.linalg.det(turn):.3g}", "remove scale and mirroring"
+            raise ValueError(f"viewmat[:3, :3] must be a rotation, got {found}; {remedy}")
+        if np.abs(row - _LAST).max() > _ROUNDING:
+            remedy = "give the translation as the last column"
+            raise ValueError(f"the last row of viewmat must be 0, 0, 0, 1, got {row.tolist()}; {remedy}")
 
     def __repr__(self) -> str:
         x, y, z = self.position
@@ -96,6 +119,13 @@ class Camera:
         return self.resized(max(1, round(self.width / factor)), max(1, round(self.height / factor)))
 
 
+def _whole(name: str, value: object) -> int:
+    """A size as an ``int``, whichever type of number states it."""
+    if isinstance(value, Real) and value % 1 == 0:
+        return int(float(value))
+    raise ValueError(f"{name} must be a whole number of pixels, got {value!r:.40}")
+
+
 def look_at(position: NDArray, target: NDArray, up: NDArray, width: int, height: int, fov_y: float) -> Camera:
     """A camera at ``position`` directed at ``target``.
 
@@ -105,8 +135,19 @@ def look_at(position: NDArray, target: NDArray, up: NDArray, width: int, height:
         up: World direction that points up in the image ``[3]``; not parallel to the viewing direction.
         width: Image width in pixels.
         height: Image height in pixels.
-        fov_y: Vertical field of view in radians.
+        fov_y: Vertical field of view in radians, above 0 and below pi.
+
+    Raises:
+        ValueError: If the field of view is outside its range, the target is at the position, or the directions are
+            parallel; see also `Camera`.
     """
+    if not (isinstance(fov_y, Real) and 0 < fov_y < np.pi):
+        remedy = "convert degrees with math.radians"
+        raise ValueError(f"fov_y: expected radians above 0 and below pi, found {fov_y!r:.40}; {remedy}")
+    if np.array_equal(position, target):
+        raise ValueError(
+            f"position and target: expected two points, found {np.asarray(target).tolist()} twice; move one"
+        )
     rotation = looking_along(np.asarray(target, float) - np.asarray(position, float), up)
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation

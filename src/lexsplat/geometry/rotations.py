@@ -12,6 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+_PARALLEL = 1e-6
+"""Largest sine of the angle between parallel directions; below it, rounding decides what is up."""
+_IDENTITY = np.eye(3)
+
 
 def matrices_from_quaternions(quats: Tensor) -> Tensor:
     """Rotation matrices ``[N, 3, 3]`` of quaternions ``[N, 4]``, wxyz of any length but 0."""
@@ -99,17 +103,32 @@ def rotation_about(axis: NDArray, degrees: float) -> NDArray[np.float64]:
     return np.asarray(Rotation.from_rotvec(unit * np.radians(degrees)).as_matrix(), dtype=np.float64)
 
 
+def is_rotation(matrix: NDArray, tolerance: float) -> bool:
+    """Whether a matrix ``[3, 3]`` is a rotation; ``tolerance`` bounds the error of an entry of its Gram matrix."""
+    error = np.abs(matrix @ matrix.T - _IDENTITY).max()
+    return bool(error <= tolerance and _cross(matrix[0], matrix[1]) @ matrix[2] > 0)
+
+
 def looking_along(forward: NDArray, up: NDArray) -> NDArray[np.float64]:
     """Rotation world to camera ``[3, 3]`` (OpenCV axes) of a camera that looks along a direction.
 
     Args:
         forward: Viewing direction ``[3]``, world, of any length but 0.
         up: World direction that appears upwards ``[3]``; not parallel to ``forward``.
+
+    Raises:
+        ValueError: If ``up`` is parallel to ``forward``, or 0.
     """
-    forward = np.asarray(forward, dtype=np.float64)
+    forward, up = np.asarray(forward, dtype=np.float64), np.asarray(up, dtype=np.float64)
     forward = forward / np.linalg.norm(forward)
-    right = _cross(forward, np.asarray(up, dtype=np.float64))
-    right /= np.linalg.norm(right)
+    right = _cross(forward, up)
+    length = np.linalg.norm(right)
+    if length <= _PARALLEL * np.linalg.norm(up):
+        raise ValueError(
+            f"up: expected a direction that is not parallel to the viewing direction {forward.round(6).tolist()}, "
+            f"found {up.tolist()}; choose another one"
+        )
+    right /= length
     return np.array([right, _cross(forward, right), forward])
 
 

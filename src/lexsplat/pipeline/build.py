@@ -309,6 +309,7 @@ class _Builder:
         else:
             views = TrainingViews(self._training_views, features=self._feature_maps())
         field = self.method.fit(gaussians, views, self.config, self._fit_run())
+        field.method = self.method.name
         metadata = {**field.metadata(), "reconstruction": self.fingerprints["reconstruct"]}
         write_tensors(self.folder.language_path, field.tensors(), metadata)
         facts: dict[str, Any] = {"method": field.method, **field.facts()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 import torch
@@ -55,13 +56,14 @@ def surface_at(gaussians: Gaussians, camera: Camera, x: float, y: float) -> Hit:
         y: Pixels from the top.
 
     Raises:
-        QueryError: If the pixel lies outside the image or shows nothing.
+        QueryError: If the pixel is not of two numbers, lies outside the image, or shows nothing.
     """
-    if not (0 <= x < camera.width and 0 <= y < camera.height):
+    numbers = isinstance(x, Real) and isinstance(y, Real)
+    if not (numbers and 0 <= x < camera.width and 0 <= y < camera.height):
         raise QueryError(
-            f"pixel ({x:g}, {y:g})",
+            f"pixel ({x:g}, {y:g})" if numbers else f"pixel ({x!r:.20}, {y!r:.20})",
             expected=f"a pixel of a {camera.width}x{camera.height} image",
-            found="one outside it",
+            found="one outside it" if numbers else "something other than numbers",
         )
     K = camera.K.copy()
     K[:2, 2] += 0.5 - np.array([x, y])

@@ -349,6 +349,8 @@ class Selection:
     def _combined(
         self, other: Selection, word: str, combine: Callable[[Tensor, Tensor], Tensor]
     ) -> Selection:
+        if not isinstance(other, Selection):
+            return NotImplemented
         if len(self.mask) != len(other.mask):
             raise ValueError("the selections are of different scenes")
         mask = combine(self.mask, other.mask)

@@ -104,11 +104,11 @@ def _camera(data: Any) -> Camera:
     width, height, focal, x, y = _numbers("lens", data.get("lens"), 5)
     if not (1 <= width <= MOST_PIXELS and 1 <= height <= MOST_PIXELS and focal > 0):
         raise QueryError("lens", expected=f"1 to {MOST_PIXELS} pixels and a focal length", found=f"{width:g}")
-    turn = viewmat[:3, :3]
-    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
-        raise QueryError("viewmat", expected="a rotation and a translation", found="another matrix")
     K = np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
-    return Camera(int(width), int(height), K, viewmat)
+    try:
+        return Camera(int(width), int(height), K, viewmat)
+    except ValueError as error:
+        raise QueryError("viewmat", expected="a rotation and a translation", found=str(error)) from error
 
 
 def _numbers(name: str, values: Any, count: int) -> list[float]:

@@ -274,7 +274,6 @@ def field_from_means(
         codes.reshape(-1, levels * kept),
         weights.reshape(-1, levels * kept) / levels,
         uncertainties.reshape(-1, levels).mean(1),
-        method="averaged",
         num_levels=levels,
     )
 

@@ -119,7 +119,7 @@ class LanguageMethod(Protocol):
         """Its ablations by name, in the order of the table; "full" changes nothing."""
 
     def fit(self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> LanguageField:
-        """Make the language field.
+        """Make the language field. Builds and tables set its ``method`` to `name`.
 
         Args:
             gaussians: The geometry, on the device to compute on. It is not changed.

@@ -150,7 +150,7 @@ class Found:
         unopened: Number of scenes that may hold it as well and were not looked at.
         skipped: Scenes that could not be asked, and why.
         rebuilt: Scenes that were built again since they were added, and what to do.
-        encoders: Names of the encoders of the scenes.
+        encoders: Names of the encoders of the scenes, one for each encoder.
     """
 
     phrase: str

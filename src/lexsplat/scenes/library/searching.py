@@ -216,7 +216,7 @@ class Candidates:
         unproposed: Number of scenes that a server did not propose, although they may hold it.
         skipped: Scenes that cannot be compared, and why.
         rebuilt: Scenes that were built again, and what to do: their old codes rule out nothing.
-        encoders: Names of the encoders of all scenes.
+        encoders: Names of the encoders of all scenes, one for each encoder.
     """
 
     ranked: list[tuple[str, float]]
@@ -248,7 +248,9 @@ def candidates(library: Library, phrase: Phrase) -> Candidates:
             continue
         found += [(record.name, bound) for record, bound in zip(group, bounds) if bound >= SURELY_NOT]
     ranked = sorted(found, key=lambda entry: (-entry[1], entry[0]))
-    encoders = tuple(sorted({record.clip for record in records}))
+    # An encoder may have several names, of which "bundled" tells which words it knows.
+    last = sorted(records, key=lambda record: record.clip == "bundled")
+    encoders = tuple(sorted({record.group: record.clip for record in last}.values()))
     return Candidates(ranked, unproposed, skipped, again, encoders)
 
 
