@@ -23,7 +23,8 @@ SINGLE = (
     'the "red apple" and the duck', "is there a zebra or a duck?", "is there a zebra and a duck?", "pink things",
     "red toy", "orange fruit", "yellow fruit", "blue toy", "something with leaves", "things with leaves",
     "can you see the mug?", "How many books?", "zebra", "red apple", "handle", "which things are toys?",
-    "is the plant dead?", "where is the duck standing?", "how many wheels does the car have?", "things that are animals",
+    "is the plant dead?", "where is the duck standing?", "how many wheels does the car have?",
+    "things that are animals",
 )  # fmt: skip
 FURTHER = (
     "banana next to the apple", "apple on the table", "what is on the table?", "the biggest toy", "the largest fruit",
