@@ -69,8 +69,8 @@ class Export:
         if not self.force:
             _refuse_existing(self.file)
         if self.select or self.language:
-            # As a full path, so that the note of `open_folder` is not printed again.
-            scene = open_scene(str(folder.root.resolve()), self.device, self.clip)
+            # As a full path and with steps, so that the notes of `open_folder` are not printed again.
+            scene = open_scene(str(folder.root.resolve()), self.device, self.clip, shows_steps=True)
             found = [
                 dataclasses.replace(scene.find(phrase, self.view, threshold=self.threshold), phrase=phrase)
                 for phrase in self.select
