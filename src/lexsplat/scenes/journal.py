@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from lexsplat.runtime.errors import FileFormatError, SceneFolderError
+from lexsplat.runtime.files import naming
 from lexsplat.scenes.filling import Fill
 from lexsplat.scenes.scene import Scene
 
@@ -139,7 +140,7 @@ class Journal:
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
         lines = [entry] if self._size else [self._header(), entry]
-        with open(self.path, "a", encoding="utf-8") as file:
+        with naming(self.path), open(self.path, "a", encoding="utf-8") as file:
             _lock(file)
             before = os.fstat(file.fileno()).st_size
             try:

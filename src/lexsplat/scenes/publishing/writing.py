@@ -14,7 +14,7 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.kinds import words_of_things
 from lexsplat.queries.scoring import form_used
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
-from lexsplat.runtime.files import read_json, write_json
+from lexsplat.runtime.files import naming, read_json, write_json
 from lexsplat.runtime.progress import Event
 from lexsplat.scenes.formats.language import stored_language
 from lexsplat.scenes.publishing.english import english_file
@@ -108,7 +108,7 @@ def publish(scene: Scene, target: Path, options: PublishOptions | None = None) -
     check_target(target, options.single_file)
     _check_scene(scene.gaussians, options.max_splats)
     target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as work:
+    with naming(target), tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as work:
         folder = Path(work) / "page"
         folder.mkdir()
         manifest = _write_content(scene, folder, options)
