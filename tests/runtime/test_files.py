@@ -46,7 +46,9 @@ def test_an_error_of_a_write_names_the_file_that_was_asked_for(tmp_path, name):
     assert str(raised.value.filename) == str(tmp_path / "x.json")
 
 
-@pytest.mark.parametrize("found", [OSError("no number"), FileNotFoundError(errno.ENOENT, "No such file", "y")])
+@pytest.mark.parametrize(
+    "found", [OSError("no number"), FileNotFoundError(errno.ENOENT, "No such file", "y")]
+)
 def test_an_error_of_another_file_keeps_its_name(tmp_path, found):
     told = str(found)
     with pytest.raises(OSError) as raised, naming(tmp_path / "x.json"):
