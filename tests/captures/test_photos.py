@@ -370,7 +370,7 @@ def test_a_video_beside_photos_is_left_out_and_one_alone_is_to_be_given_itself(t
     three_photos(folder)
     (folder / "walk.MP4").touch()
     (note,) = prepare_photos(folder, tmp_path / "out").notes
-    assert note.startswith(f"{folder}: walk.MP4 is left out: a video is no photo")
+    assert note.startswith(f"{folder}: walk.MP4 is left out: a video is given by itself")
     for path in folder.glob("*.jpg"):
         path.unlink()
     with pytest.raises(CaptureError, match=r"found 0; walk\.MP4 is left out.*; give .*photos/walk\.MP4$"):

@@ -30,7 +30,7 @@ from lexsplat.captures.images.reading import (
     sizes_agree,
 )
 from lexsplat.captures.readers.camera_files import checked_name
-from lexsplat.captures.readers.video import VIDEO_SUFFIXES
+from lexsplat.captures.readers.video import videos_in
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path, link_or_copy
@@ -192,20 +192,15 @@ def _of_all(names: Sequence[str], look: Callable[[str], _Found]) -> list[_Found]
 
 def _left_out(folder: Path) -> list[str]:
     """A note on image files of formats that are not read, and one on videos, if there are any."""
-    other, videos = (_files(folder, endings) for endings in (_NOT_READ, VIDEO_SUFFIXES))
+    other = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in _NOT_READ and p.is_file())
     notes = []
     if other:
         told = "is left out: its format is" if len(other) == 1 else "are left out: their formats are"
         notes.append(f"{_some(other)} {told} not read; save as JPEG or PNG")
-    if videos:
+    if videos := videos_in(folder):
         told = "is left out: a video is" if len(videos) == 1 else "are left out: videos are"
-        notes.append(f"{_some(videos)} {told} no photo; a build takes one video or a folder of photos")
+        notes.append(f"{_some(videos)} {told} given by itself, without photos")
     return notes
-
-
-def _files(folder: Path, endings: Sequence[str]) -> list[str]:
-    """Names of the files of a folder with one of some endings, sorted."""
-    return sorted(p.name for p in folder.iterdir() if p.suffix.lower() in endings and p.is_file())
 
 
 def _some(names: Sequence[str]) -> str:
@@ -240,7 +235,7 @@ def checked_photos(folder: Path, output: Path) -> list[str]:
         )
     names = find_photos(folder, output)
     if len(names) < 3:
-        videos = _files(folder, VIDEO_SUFFIXES)
+        videos = videos_in(folder)
         raise CaptureError(
             folder,
             expected="at least 3 photos",
