@@ -75,8 +75,9 @@ class Export:
                 dataclasses.replace(scene.find(phrase, self.view, threshold=self.threshold), phrase=phrase)
                 for phrase in self.select
             ]
-            for thing in exported(scene, self.file, found):
-                print(f"{thing.phrase}: {len(thing):,} Gaussians{PRESENCE[thing.present]}")
+            for asked, thing in zip(found, exported(scene, self.file, found)):
+                whole = f", {len(thing):,} with the hidden ones inside it" if len(thing) > len(asked) else ""
+                print(f"{asked.phrase}: {len(asked):,} Gaussians{whole}{PRESENCE[asked.present]}")
             with uncounted(scene.listener, "export"):
                 files = export_scene(scene, self.file, found=found, language=self.language, overwrite=True)
         else:
