@@ -180,7 +180,10 @@ def test_a_page_that_shows_an_earlier_scene_is_reported_and_shows_the_present_on
     page.keyboard.press("Enter")
     until(page, "lexsplat.app.server.entry.version === 2")
     assert page.evaluate("lexsplat.app.geometry.count") == 1200
-    until(page, "document.querySelector('.status')?.textContent.includes('edited in another page')")
+    until(page, "document.querySelector('.status')?.textContent.includes('edited elsewhere')")
+    assert page.locator(".card strong").all_inner_texts() == ["ball 1"], "what was typed is asked again"
+    assert "here, one place" in page.locator(".card").inner_text()
+    assert page.evaluate("lexsplat.app.search.input.value") == ""
 
 
 def test_objects_are_listed_and_other_colors_shown(page, viewer):

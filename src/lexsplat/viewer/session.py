@@ -258,6 +258,29 @@ class Session:
                 found=error.strerror or str(error),
                 remedy="nothing was changed: make room and try again",
             ) from error
+        return self._show_prepared()
+
+    def catch_up(self) -> None:
+        """Show the steps that another program has kept or discarded meanwhile.
+
+        Raises:
+            FileFormatError: If they are damaged.
+            SceneFolderError: If they belong to another reconstruction.
+            QueryError: If the scene with them cannot be drawn.
+        """
+        with self.lock:
+            before = self.editor
+            if before.journal is None or before.journal.is_unchanged:
+                return
+            self.editor = Editor(before.original, before.journal.path, self._prepare)
+            try:
+                self._prepare()
+            except BaseException:
+                self.editor = before
+                raise
+            self._show_prepared()
+
+    def _show_prepared(self) -> dict[str, Any]:
         self.content = self._prepared
         self.version = self.content.manifest["server"]["version"]
         return self.content.manifest
