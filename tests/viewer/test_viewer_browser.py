@@ -300,3 +300,11 @@ def test_every_tool_can_be_pressed_on_small_windows(page):
         page.set_viewport_size({"width": width, "height": height})
         page.wait_for_timeout(100)
         assert covered_tools(page) == [], (width, height)
+
+
+def test_a_link_with_a_phrase_that_is_refused_shows_the_scene_and_says_why(browser, viewer):
+    opened = open_page(browser, f"{viewer.url}/#q=%22&view=view0", 720, 480)
+    assert "quotation marks in pairs" in opened.locator(".status").inner_text()
+    ask(opened, "ball 1")
+    assert "here, one place" in opened.locator(".card").inner_text()
+    opened.close()

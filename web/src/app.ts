@@ -116,8 +116,8 @@ export class App {
   }
 
   /** Do something; what fails is told in one line. */
-  run(work: () => Promise<void>): void {
-    work().catch((error: unknown) => {
+  run(work: () => Promise<void>): Promise<void> {
+    return work().catch((error: unknown) => {
       // An edit may have put another page of the scene in the place of this one.
       (window.lexsplat.app ?? this).note(error instanceof PageError ? error.message : `That failed: ${String(error)}`);
       if (!(error instanceof PageError)) console.error(error);
