@@ -268,9 +268,11 @@ class Session:
             SceneFolderError: If they belong to another reconstruction.
             QueryError: If the scene with them cannot be drawn.
         """
+        if self._is_current:
+            return  # a page that loads does not wait for the work of another
         with self.lock:
             before = self.editor
-            if before.journal is None or before.journal.is_unchanged:
+            if self._is_current or before.journal is None:
                 return
             self.editor = Editor(before.original, before.journal.path, self._prepare)
             try:
@@ -279,6 +281,10 @@ class Session:
                 self.editor = before
                 raise
             self._show_prepared()
+
+    @property
+    def _is_current(self) -> bool:
+        return self.editor.journal is None or self.editor.journal.is_unchanged
 
     def _show_prepared(self) -> dict[str, Any]:
         self.content = self._prepared
