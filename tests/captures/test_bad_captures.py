@@ -16,6 +16,8 @@ class TestBadCaptures:
         (tmp_path / "notes.txt").write_text("x")
         fails(tmp_path, "neither cameras nor photos")
         fails(tmp_path / "notes.txt", "a file")
+        (tmp_path / "walk.mp4").touch()
+        fails(tmp_path, "neither cameras nor photos, but walk.mp4; give ", "walk.mp4")
 
     def test_photos_without_cameras_point_to_poses(self, tmp_path):
         write_images(tmp_path, NAMES[:3])

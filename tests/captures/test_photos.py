@@ -396,6 +396,29 @@ def test_images_of_formats_that_are_not_read_are_named(tmp_path):
         prepare_photos(tmp_path / "photos", tmp_path / "output")
 
 
+def test_a_video_beside_photos_is_left_out_and_one_alone_is_to_be_given_itself(tmp_path):
+    folder = tmp_path / "photos"
+    three_photos(folder)
+    (folder / "walk.MP4").touch()
+    (note,) = prepare_photos(folder, tmp_path / "out").notes
+    assert note.startswith(f"{folder}: walk.MP4 is left out: a video is given by itself")
+    for path in folder.glob("*.jpg"):
+        path.unlink()
+    with pytest.raises(CaptureError, match=r"found 0; walk\.MP4 is left out.*; give .*photos/walk\.MP4$"):
+        prepare_photos(folder, tmp_path / "out")
+
+
+def test_photos_that_differ_in_their_endings_only_are_noted(tmp_path):
+    (tmp_path / "photos/in").mkdir(parents=True)
+    for name in ("c01.png", "c01.jpg", "in/c02.png", "in/c02.webp", "c02.png"):
+        Image.new("L", (8, 8)).save(tmp_path / "photos" / name)
+    twins = prepare_photos(tmp_path / "photos", tmp_path / "out").notes[0]
+    told = (
+        "2 pairs of photos with one name and two endings, such as c01.jpg and c01.png: the same shot twice?"
+    )
+    assert told in twins
+
+
 @pytest.mark.parametrize("name", [b"a\nb.jpg", b"a\\b.jpg", b"\xff\xfe.jpg", b"sub\x7f/a.jpg"])
 def test_names_that_camera_files_cannot_hold_are_refused_before_any_work(tmp_path, name):
     three_photos(tmp_path / "photos")

@@ -12,7 +12,8 @@ from lexsplat import cli, open_scene
 from lexsplat.cli.waiting import LateProgress
 from lexsplat.queries.visibility import whole_things
 from lexsplat.scenes import editing
-from lexsplat.scenes.folder import BUNDLED_SCENE
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
+from lexsplat.scenes.unsaved import unsaved_steps
 
 
 def without_texts(times):
@@ -196,3 +197,61 @@ def test_an_edited_scene_is_saved_neither_in_a_folder_nor_over_a_file_that_exist
     (tmp_path / "notes.txt").write_text("mine")
     taken = str(tmp_path / "notes.txt")
     fails_in_one_line(capsys, [*command, taken], "expected a new folder, found a file that exists")
+
+
+@pytest.fixture
+def with_a_step(built, tmp_path, capsys):
+    """A copy of the scene with a step that no scene holds."""
+    copy = shutil.copytree(built, tmp_path / "my scene")
+    chosen = ("--select", "blue ball", "--threshold", "0.05", "--largest")
+    assert cli.main(["edit", str(copy), "recolor", *chosen, "--color", "red"]) == 0
+    told = capsys.readouterr().err
+    assert told.count(f"lexsplat edit '{copy}' save --output SCENE2 makes a scene with it") == 1
+    return copy
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["export", "SCENE", "OUT.ply"],
+        ["export", "SCENE", "OUT.ply", "--select", "blue ball", "--threshold", "0.05"],
+        ["publish", "SCENE", "OUT", "--words-only"],
+        ["find", "SCENE", "blue ball", "--json"],
+        ["query", "SCENE", "blue ball", "--no-images", "--json"],
+        ["ask", "SCENE", "blue ball"],
+        ["list", "SCENE", "--json"],
+    ],
+)
+def test_a_command_that_reads_a_scene_notes_once_that_steps_are_not_in_it(
+    with_a_step, tmp_path, capsys, command
+):
+    told = f"note: 1 step of lexsplat edit is not in this scene; lexsplat edit '{with_a_step}' save --output SCENE2"
+    places = {"SCENE": str(with_a_step), "OUT": str(tmp_path / "out"), "OUT.ply": str(tmp_path / "a.ply")}
+    assert cli.main([places.get(word, word) for word in command]) == 0
+    captured = capsys.readouterr()
+    assert captured.err.count(told) == 1
+    assert "note: 1 step" not in captured.out
+    assert cli.main(["edit", str(with_a_step), "undo"]) == 0
+    assert cli.main(["edit", str(with_a_step), "list"]) == 0
+    capsys.readouterr()
+    assert (
+        cli.main([places.get(word, word) for word in command] + ["--force"] * (command[0] == "export")) == 0
+    )
+    assert "of lexsplat edit" not in capsys.readouterr().err
+
+
+def test_info_counts_the_steps_that_the_scene_does_not_hold(with_a_step, capsys):
+    assert cli.main(["info", str(with_a_step)]) == 0
+    captured = capsys.readouterr()
+    line = next(line for line in captured.out.splitlines() if line.startswith("unsaved steps"))
+    assert line.split(maxsplit=2)[2].startswith("1; lexsplat edit ")
+    assert "note:" not in captured.err
+    assert cli.main(["info", str(with_a_step), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["unsaved_steps"] == 1
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\n", b"{}\n3\n", b'{}\n{"undo": true}\n', b"{}\n{\n"])
+def test_a_damaged_journal_has_no_steps_to_note(tmp_path, content):
+    folder = SceneFolder(tmp_path)
+    (tmp_path / "edits.jsonl").write_bytes(content)
+    assert unsaved_steps(folder) == 0

@@ -1,5 +1,6 @@
 """Files are whole or not there, and what is read is what was written."""
 
+import errno
 import json
 import os
 import stat
@@ -9,7 +10,7 @@ import torch
 
 from lexsplat.runtime import files
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.runtime.files import atomic_path, read_json, read_tensors, write_json, write_tensors
+from lexsplat.runtime.files import atomic_path, naming, read_json, read_tensors, write_json, write_tensors
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -35,6 +36,35 @@ def test_an_error_of_the_system_names_the_file_and_not_its_temporary_name(tmp_pa
     with pytest.raises(OSError, match="other") as caught, atomic_path(target):
         raise OSError(28, "No space left on device", "other")
     assert caught.value.filename == "other"
+
+
+@pytest.mark.parametrize("name", [None, "x.json", ".x.json.1.2.tmp", ".x.json.work/page/codes.bin"])
+def test_an_error_of_a_write_names_the_file_that_was_asked_for(tmp_path, name):
+    found = None if name is None else tmp_path / name
+    with pytest.raises(OSError, match="No space") as raised, naming(tmp_path / "x.json"):
+        raise OSError(errno.ENOSPC, "No space left on device", found)
+    assert str(raised.value.filename) == str(tmp_path / "x.json")
+
+
+@pytest.mark.parametrize(
+    "found", [OSError("no number"), FileNotFoundError(errno.ENOENT, "No such file", "y")]
+)
+def test_an_error_of_another_file_keeps_its_name(tmp_path, found):
+    told = str(found)
+    with pytest.raises(OSError) as raised, naming(tmp_path / "x.json"):
+        raise found
+    assert str(raised.value) == told
+
+
+def test_a_file_in_a_file_system_that_is_read_only_is_named(tmp_path, monkeypatch):
+    def refused(path, *_, **__):
+        raise OSError(errno.EROFS, "Read-only file system", path)
+
+    monkeypatch.setattr(os, "unlink", refused)  # as Linux refuses it, even of a file that is not there
+    monkeypatch.setattr(os, "open", refused)
+    with pytest.raises(OSError, match="Read-only") as raised, atomic_path(tmp_path / "x.json") as temporary:
+        temporary.touch()
+    assert raised.value.filename == str(tmp_path / "x.json")
 
 
 def test_nan_never_reaches_a_json_file(tmp_path):

@@ -96,7 +96,9 @@ def test_a_scene_on_a_full_disk_stays_as_it_was(built, small_disk, tmp_path):
     shutil.copytree(built, scene)
     before = content(scene)
     (small_disk / "ballast").write_bytes(b"\0" * 590_000)
-    assert_one_line(run("export", str(scene), str(small_disk / "scene.ply")))
+    exported = run("export", str(scene), str(small_disk / "scene.ply"))
+    assert_one_line(exported)
+    assert f"error: {small_disk / 'scene.ply'}: No space left" in exported.stderr
     assert not (small_disk / "scene.ply").exists()
     assert content(scene) == before
     open_scene(scene, device="cpu")
@@ -149,7 +151,11 @@ def test_an_edit_and_an_export_that_cannot_write_leave_nothing_half_done(built, 
     for ending in ("ply", "splat", "glb"):
         done = run_limited(2_000, "export", str(built), str(tmp_path / f"out.{ending}"))
         assert_one_line(done)
+        assert f"error: {tmp_path / 'out'}.{ending}: " in done.stderr, "the file that was asked for"
         assert not (tmp_path / f"out.{ending}").exists()
+    published = run_limited(2_000, "publish", str(built), str(tmp_path / "page"), "--words-only")
+    assert_one_line(published)
+    assert f"error: {tmp_path / 'page'}: " in published.stderr
     scene = tmp_path / "scene"
     shutil.copytree(built, scene)
     assert run("edit", str(scene), "delete", "--select", "red apple", "--threshold", "0.01").returncode == 0

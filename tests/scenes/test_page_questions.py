@@ -10,6 +10,7 @@ from questions import questions
 from support.page_browser import CHROMIUM, ask, open_page, serving, until
 
 from lexsplat.queries.phrases import Anything, Both, Colored, Thing, Together, parts_of
+from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.scene import Scene, open_scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
@@ -142,3 +143,14 @@ def test_words_that_name_nothing_are_not_compared_with_the_phrases(page):
     assert nearest
     assert all("duck" in phrase for phrase in nearest)
     assert page.evaluate("lexsplat.app.source.dictionary.complete('where is the pump')[0]") == "pumpkin"
+
+
+@pytest.mark.parametrize("prompt", ['"', 'red "apple', '"red" "apple'])
+def test_a_quotation_mark_without_its_pair_is_not_answered_as_python_refuses_it(page, demo, prompt):
+    with pytest.raises(QueryError, match="expected quotation marks in pairs, found an odd number"):
+        demo.find(prompt)
+    ask(page, prompt)
+    card = page.locator(".card")
+    assert card.locator(".state").inner_text() == "not answered here"
+    assert card.locator(".fine").inner_text() == "Expected quotation marks in pairs, found an odd number."
+    assert page.evaluate("lexsplat.app.answers[0].places") == []

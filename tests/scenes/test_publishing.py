@@ -168,6 +168,23 @@ def test_what_was_asked_in_the_viewer_comes_first_as_plain_text(scene_of_balls, 
     assert len(lines) == len(phrases)
 
 
+def test_phrases_from_the_viewer_are_noted_with_their_file_and_no_truncated_one_is_offered(
+    scene_of_balls, tmp_path, monkeypatch, caplog
+):
+    write_json(tmp_path / "viewer.json", {"history": ["blue lamp", "x" * 80, "mug left of the duck", "cup"]})
+    scene = scene_of_balls
+    monkeypatch.setattr(scene, "folder", SceneFolder(tmp_path))
+    monkeypatch.setattr(type(scene), "tokens_over", lambda _, text: max(len(text) - 77, 0), raising=False)
+    with caplog.at_level("INFO", logger="lexsplat"):
+        phrases = vocabulary.offered_phrases(scene)
+    assert [phrase for phrase, kind in phrases.items() if kind == vocabulary.ASKED] == ["blue lamp", "cup"]
+    told = "2 phrases are offered to visitors, and 1 left out that the encoder would truncate"
+    assert caplog.messages == [f"{tmp_path / 'viewer.json'}: {told}"]
+    (tmp_path / "viewer.json").unlink()
+    vocabulary.offered_phrases(scene)
+    assert len(caplog.messages) == 1, "nothing was asked"
+
+
 def test_only_things_that_were_asked_for_are_in_the_dictionary_as_a_table_answers_no_relations():
     asked = [
         "mug left of the duck",

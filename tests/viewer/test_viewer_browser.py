@@ -180,7 +180,10 @@ def test_a_page_that_shows_an_earlier_scene_is_reported_and_shows_the_present_on
     page.keyboard.press("Enter")
     until(page, "lexsplat.app.server.entry.version === 2")
     assert page.evaluate("lexsplat.app.geometry.count") == 1200
-    until(page, "document.querySelector('.status')?.textContent.includes('edited in another page')")
+    until(page, "document.querySelector('.status')?.textContent.includes('edited elsewhere')")
+    assert page.locator(".card strong").all_inner_texts() == ["ball 1"], "what was typed is asked again"
+    assert "here, one place" in page.locator(".card").inner_text()
+    assert page.evaluate("lexsplat.app.search.input.value") == ""
 
 
 def test_objects_are_listed_and_other_colors_shown(page, viewer):
@@ -297,3 +300,11 @@ def test_every_tool_can_be_pressed_on_small_windows(page):
         page.set_viewport_size({"width": width, "height": height})
         page.wait_for_timeout(100)
         assert covered_tools(page) == [], (width, height)
+
+
+def test_a_link_with_a_phrase_that_is_refused_shows_the_scene_and_says_why(browser, viewer):
+    opened = open_page(browser, f"{viewer.url}/#q=%22&view=view0", 720, 480)
+    assert "quotation marks in pairs" in opened.locator(".status").inner_text()
+    ask(opened, "ball 1")
+    assert "here, one place" in opened.locator(".card").inner_text()
+    opened.close()

@@ -10,8 +10,10 @@ import torch
 from plyfile import PlyData
 from support.viewer_scene import WORDS, ball_scene
 
-from lexsplat.runtime.errors import QueryError, SceneFolderError
+from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
+from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.journal import Journal
+from lexsplat.viewer.app import make_app
 from lexsplat.viewer.history import History
 from lexsplat.viewer.requests import Asked
 from lexsplat.viewer.session import Session
@@ -292,3 +294,44 @@ def test_deleting_an_apple_is_previewed_with_what_is_hidden_inside_it():
     assert shown < count == sum(reply[4:])
     assert count <= int(gone.sum()) <= 1.1 * count, "and remains under it, which no view shows"
     assert gone[drawn][torch.tensor(list(reply[4:]), dtype=torch.bool)].all()
+
+
+def test_steps_of_another_program_are_shown_when_a_session_catches_up(scene_and_balls, tmp_path):
+    scene, _ = scene_and_balls
+    session, path = Session(scene, 1_000_000, History()), tmp_path / "edits.jsonl"
+    session.editor = Editor(scene, path, session._prepare)
+    session.catch_up()
+    assert session.version == 1, "nothing is new"
+    other = Editor(scene, path)
+    other.delete(scene.select("ball 0"), fill=False)
+    session.catch_up()
+    assert (session.version, session.content.manifest["server"]["version"]) == (2, 2)
+    assert len(session.scene.gaussians) == len(other.scene.gaussians) < len(scene.gaussians)
+    session.edit("undo", Asked(), {})
+    assert len(Editor(scene, path).undone) == 1, "it goes on after them"
+    path.unlink()  # as "discard" does
+    session.catch_up()
+    assert (session.version, session.editor.undone) == (4, [])
+    path.write_text("no journal\n")
+    before = session.content
+    with pytest.raises(FileFormatError, match="discard the edit"):
+        session.catch_up()
+    assert session.content is before
+
+
+def test_a_page_is_told_that_another_program_has_edited_the_scene(scene_and_balls, tmp_path):
+    from starlette.testclient import TestClient
+
+    scene, _ = scene_and_balls
+    session, path = Session(scene, 1_000_000, History()), tmp_path / "edits.jsonl"
+    session.editor = Editor(scene, path, session._prepare)
+    client = TestClient(make_app(session))
+    asked = {"version": 1, "prompt": "ball 1"}
+    assert client.post("/objects", json=asked).status_code == 200
+    Editor(scene, path).delete(scene.select("ball 0"), fill=False)
+    assert client.post("/objects", json=asked).status_code == 409
+    assert client.post("/objects", json={**asked, "version": 2}).status_code == 200
+    path.write_text("no journal\n")
+    assert client.get("/manifest.json").json()["server"]["version"] == 2
+    refused = client.post("/objects", json={**asked, "version": 2})
+    assert (refused.status_code, "discard the edit" in refused.text) == (400, True)

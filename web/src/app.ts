@@ -15,7 +15,7 @@ import { objectsPanel, titleOf, viewsPanel } from "./panels";
 import { prompts } from "./questions";
 import { type Change, MOST_PROMPTS, type Mode, Painter, type Preview } from "./painter";
 import { SearchBar } from "./search";
-import { Server } from "./server";
+import { OutdatedError, Server } from "./server";
 import { type Stage, pose } from "./stage";
 import { readState, writeState } from "./state";
 import { Tables } from "./tables";
@@ -116,8 +116,8 @@ export class App {
   }
 
   /** Do something; what fails is told in one line. */
-  run(work: () => Promise<void>): void {
-    work().catch((error: unknown) => {
+  run(work: () => Promise<void>): Promise<void> {
+    return work().catch((error: unknown) => {
       // An edit may have put another page of the scene in the place of this one.
       (window.lexsplat.app ?? this).note(error instanceof PageError ? error.message : `That failed: ${String(error)}`);
       if (!(error instanceof PageError)) console.error(error);
@@ -177,13 +177,14 @@ export class App {
     if (fly && first) this.#flyTo(first);
   }
 
-  /** Ask what was typed; what fails is typed again. */
+  /** Ask what was typed, if need be of the scene as it is by now; what fails is typed again. */
   async #typed(text: string, add: boolean): Promise<void> {
     try {
       await this.ask(text, add);
     } catch (error) {
-      const { input } = (window.lexsplat.app ?? this).search;
-      input.value ||= text;
+      const app = window.lexsplat.app ?? this;
+      if (error instanceof OutdatedError && app !== this) return app.#typed(text, add).then(() => app.note(error.message));
+      app.search.input.value ||= text;
       throw error;
     }
   }

@@ -45,7 +45,7 @@ async function start(root: HTMLElement): Promise<App> {
   const app = await show(files, manifest, stage, root);
   progress.remove();
   root.classList.add("ready");
-  await Promise.all([app.restore(), app.answering]);
+  await Promise.all([app.run(() => app.restore()), app.answering]);
   return app;
 }
 

@@ -28,6 +28,9 @@ export interface Details {
   views: { name: string; share: number }[];
 }
 
+/** The scene was edited meanwhile and is shown anew; the question was not answered. */
+export class OutdatedError extends PageError {}
+
 export class Server implements Source {
   readonly examples: string[];
   readonly entry: ServerEntry;
@@ -142,7 +145,7 @@ export class Server implements Source {
     if (response.ok) return response;
     if (response.status === 409) {
       await this.reload(null);
-      throw new PageError("The scene was edited in another page; it is shown as it is now.");
+      throw new OutdatedError("The scene was edited elsewhere; it is shown as it is now.");
     }
     const told = (await response.json().catch(() => null)) as { error?: { message?: string } } | null;
     throw new PageError(told?.error?.message ?? `The server answered ${response.status}; reload the page.`);

@@ -45,6 +45,7 @@ export class Tables implements Source {
   }
 
   async answer(prompt: string, color: string): Promise<Answer | null> {
+    if (prompt.split('"').length % 2 === 0) return this.#unanswered(prompt, color, '"', "Expected quotation marks in pairs, found an odd number.", []);
     const question = understood(prompt, this.dictionary.grammar);
     const { things, beyond, left, state } = question;
     const plain = things.length === 1 && !things[0].color && !beyond && !left && !state;
@@ -68,7 +69,10 @@ export class Tables implements Source {
   #beyond({ things, beyond }: Question, prompt: string, color: string): Answer {
     const named = things.map(({ text, color: own }) => [own, text || (own && "things")].filter(Boolean).join(" "));
     const offers = [...new Set(named.filter(Boolean).map((name) => this.spelling?.singular(name) ?? name))];
-    const note = `This page finds single things. “${beyond}” needs lexsplat view.`;
+    return this.#unanswered(prompt, color, beyond, `This page finds single things. “${beyond}” needs lexsplat view.`, offers);
+  }
+
+  #unanswered(prompt: string, color: string, beyond: string, note: string, offers: string[]): Answer {
     const found = { phrase: prompt, from: "page", scores: new Float32Array(this.geometry.count), places: [], presence: "unsure" as const };
     return answered(prompt, color, { ...found, threshold: this.geometry.rule.threshold, note, unknown: true, beyond, offers });
   }

@@ -133,6 +133,6 @@ function editor(
 
 /** What an edit applies to, in words; hidden parts count too. */
 function told(kind: Change, count: number): string {
-  const hole = kind === "delete" ? " The surface under it is closed when you apply." : "";
+  const hole = kind === "delete" ? " When you apply, what no photo shows under it goes too, and the surface there is closed." : "";
   return `${count.toLocaleString("en")} Gaussians with the hidden ones inside it.${hole}`;
 }

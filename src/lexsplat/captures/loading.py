@@ -15,7 +15,7 @@ from lexsplat.captures.images.undistortion import pinhole_of
 from lexsplat.captures.readers.camera_files import CameraFiles, Photo
 from lexsplat.captures.readers.colmap import find_model, read_colmap
 from lexsplat.captures.readers.transforms_json import find_transforms, read_transforms
-from lexsplat.captures.readers.video import is_video
+from lexsplat.captures.readers.video import is_video, videos_in
 from lexsplat.captures.splits import choose_test_names
 from lexsplat.geometry.cameras import Camera
 from lexsplat.runtime.errors import CaptureError
@@ -163,11 +163,12 @@ def _read_camera_files(path: Path, images: Path | None) -> CameraFiles:
             found=f"{len(photos)} photos without cameras",
             remedy=f"run: lexsplat poses {quote(str(path))}",
         )
+    found, videos = "neither cameras nor photos", videos_in(path)
     raise CaptureError(
         path,
         expected="photos with a COLMAP model in sparse/0 or a transforms.json",
-        found="an empty folder" if not any(path.iterdir()) else "neither cameras nor photos",
-        remedy="give the folder of a capture",
+        found=f"{found}, but {videos[0]}" if videos else found if any(path.iterdir()) else "an empty folder",
+        remedy=f"give {path / videos[0]}" if videos else "give the folder of a capture",
     )
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 
 import tyro
 
-from lexsplat.cli.options import Device, SceneArgument, note_hidden_demo
+from lexsplat.cli.options import Device, SceneArgument, note_hidden_demo, note_unsaved
 from lexsplat.cli.waiting import LateProgress, starting
 
 Phrases = tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="PHRASE ...")]]
@@ -53,6 +53,8 @@ class Ask:
         # Where a terminal has other letters, "\\u1f34e" stands for an apple; lone surrogates stay valid JSON.
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
         served = OpenScene(self.scene, self.device, self.clip, LateProgress())
+        if served.scene.folder is not None:
+            note_unsaved(served.scene.folder, self.scene)
         for phrase in self.phrases:
             print(sentence(find_phrase(served.scene, phrase)))
         if not self.stdin:

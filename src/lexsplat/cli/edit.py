@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -146,8 +147,9 @@ class Edit:
             from lexsplat.scenes.folder import file_of
             from lexsplat.scenes.previous import require_current
             from lexsplat.scenes.serving import counted
+            from lexsplat.scenes.unsaved import saving
 
-        scene = open_scene(self.scene, self.device, self.clip)
+        scene = open_scene(self.scene, self.device, self.clip, shows_steps=True)
         if scene.folder is not None:
             require_current(scene.folder)
         journal = file_of(scene.folder, "edits.jsonl")
@@ -168,6 +170,9 @@ class Edit:
             print(f"{number}. {step}")
         left = counted(len(editor.scene.gaussians), "Gaussian")
         print(f"{left}, {counted(len(editor.undone), 'step')} undone")
+        if self.action in CHANGES:
+            told = f"note: the scene stays as it is; {saving(self.scene, len(editor.steps))}"
+            print(told, file=sys.stderr)
 
     def _discard(self, journal: Path) -> None:
         if not journal.exists():

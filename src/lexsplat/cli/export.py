@@ -69,14 +69,15 @@ class Export:
         if not self.force:
             _refuse_existing(self.file)
         if self.select or self.language:
-            # As a full path, so that the note of `open_folder` is not printed again.
-            scene = open_scene(str(folder.root.resolve()), self.device, self.clip)
+            # As a full path and with steps, so that the notes of `open_folder` are not printed again.
+            scene = open_scene(str(folder.root.resolve()), self.device, self.clip, shows_steps=True)
             found = [
                 dataclasses.replace(scene.find(phrase, self.view, threshold=self.threshold), phrase=phrase)
                 for phrase in self.select
             ]
-            for thing in exported(scene, self.file, found):
-                print(f"{thing.phrase}: {len(thing):,} Gaussians{PRESENCE[thing.present]}")
+            for asked, thing in zip(found, exported(scene, self.file, found)):
+                whole = f", {len(thing):,} with the hidden ones inside it" if len(thing) > len(asked) else ""
+                print(f"{asked.phrase}: {len(asked):,} Gaussians{whole}{PRESENCE[asked.present]}")
             with uncounted(scene.listener, "export"):
                 files = export_scene(scene, self.file, found=found, language=self.language, overwrite=True)
         else:

@@ -24,13 +24,16 @@ class Info:
         """Print the facts."""
         with starting():
             from lexsplat.scenes.facts import NO_SEGMENTS, scene_facts
+            from lexsplat.scenes.unsaved import saving
 
-        facts = scene_facts(open_folder(self.scene))
+        facts = scene_facts(open_folder(self.scene, shows_steps=True))
         if self.json:
             print_json(facts)
             return
         if facts["method"] is not None and facts["segments"] is None:
             facts["segments"] = f"none: {NO_SEGMENTS}"
+        if count := facts.pop("unsaved_steps"):
+            facts["unsaved_steps"] = f"{count:,}; {saving(self.scene, count)}"
         chosen = facts.pop("chosen_views")
         if chosen is not None:
             facts["capture"] = (

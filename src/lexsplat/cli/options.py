@@ -49,8 +49,8 @@ PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probabl
 """Text printed after an answer, by its value of ``present``."""
 
 
-def open_scene(path: str, device: str, clip: str | None) -> Scene:
-    """Open the scene of a command with its encoders."""
+def open_scene(path: str, device: str, clip: str | None, shows_steps: bool = False) -> Scene:
+    """Open the scene of a command with its encoders; a command that shows no steps of an edit notes them."""
     note_hidden_demo(path)
     listener = LateProgress()
     with uncounted(listener, "scene"), loading():
@@ -58,16 +58,30 @@ def open_scene(path: str, device: str, clip: str | None) -> Scene:
 
         scene = search.open_scene(path, device=device, clip=clip)
     scene.listener = listener
+    if scene.folder is not None and not shows_steps:
+        note_unsaved(scene.folder, path)
     return scene
 
 
-def open_folder(path: str) -> SceneFolder:
-    """Open the scene folder of a command that needs no encoder."""
+def open_folder(path: str, shows_steps: bool = False) -> SceneFolder:
+    """Open the scene folder of a command that needs no encoder; see `open_scene`."""
     note_hidden_demo(path)
     with starting():
         from lexsplat.scenes.folder import SceneFolder
 
-    return SceneFolder.open(Path(path))
+    folder = SceneFolder.open(Path(path))
+    if not shows_steps:
+        note_unsaved(folder, path)
+    return folder
+
+
+def note_unsaved(folder: SceneFolder, given: str) -> None:
+    """State on standard error that steps of an edit are not in the scene that a command reads."""
+    from lexsplat.scenes.unsaved import saving, unsaved_steps
+
+    if count := unsaved_steps(folder):
+        steps = "1 step of lexsplat edit is" if count == 1 else f"{count:,} steps of lexsplat edit are"
+        print(f"note: {steps} not in this scene; {saving(given, count)}", file=sys.stderr)
 
 
 def note_hidden_demo(given: str) -> None:

@@ -98,7 +98,7 @@ class Scale:
 
         if self.points is not None:
             return positive_length(math.dist(*map(parse_vector, self.points)), "the two points")
-        scene = open_scene(folder, self.device, self.clip)
+        scene = open_scene(folder, self.device, self.clip, shows_steps=True)
         if self.between is not None:
             return length_between(scene, *self.between)
         return height_of(scene, self.height_of or "")

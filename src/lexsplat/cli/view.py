@@ -53,7 +53,7 @@ class View:
         with starting():
             from lexsplat.viewer.server import ViewerServer
 
-        scene = open_scene(self.scene, self.device, self.clip)
+        scene = open_scene(self.scene, self.device, self.clip, shows_steps=True)
         with uncounted(scene.listener, "page"):
             viewer = ViewerServer(scene, self._config())
         print(f"{self.scene} is shown at {viewer.url} (Ctrl-C stops the server)", flush=True)

@@ -27,6 +27,7 @@ from lexsplat.queries.clusters import LINK, clusters, spacing
 from lexsplat.queries.touching import divided
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import QueryError
+from lexsplat.runtime.lazy import at_first_call
 
 if TYPE_CHECKING:
     from lexsplat.queries.seen import Seen
@@ -107,6 +108,8 @@ class Selection:
             f"Selection({self.phrase[:60]!r}, present={self.present!r}, gaussians={self.num_gaussians}, "
             f"threshold={self.threshold:.3g})"
         )
+
+    _repr_html_ = at_first_call("lexsplat.queries.notebook", "selection_html")
 
     @cached_property
     def num_gaussians(self) -> int:
@@ -225,9 +228,8 @@ class Selection:
         return self._combined(other, "minus", lambda own, others: own & ~others)
 
     def __invert__(self) -> Selection:
-        return replace(
-            self, mask=~self.mask, parts=(), scores=1 - self.scores, phrase=f"not {self.phrase}".strip()
-        )
+        phrase = f"not {self.phrase}".strip()
+        return replace(self, mask=~self.mask, parts=(), scores=1 - self.scores, phrase=phrase)
 
     def grow(self, distance: float | None = None) -> Selection:
         """The union with the Gaussians within ``distance`` (world units; None derives it from the spacing).

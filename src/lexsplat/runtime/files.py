@@ -43,17 +43,27 @@ def atomic_path(path: Path, lasting: bool = True) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{get_ident()}.tmp")
     try:
-        yield temporary
-        if lasting:
-            with open(temporary, "rb") as file:
-                os.fsync(file.fileno())
-        os.replace(temporary, path)
+        with naming(path):
+            yield temporary
+            if lasting:
+                with open(temporary, "rb") as file:
+                    os.fsync(file.fileno())
+            os.replace(temporary, path)
+    finally:
+        with contextlib.suppress(OSError):  # a read-only file system refuses it even where there is no file
+            temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Errors of the system in the block name ``path``, not nothing and not a temporary ``.NAME.*`` beside it."""
+    try:
+        yield
     except OSError as error:
-        if error.filename == str(temporary):
+        beside = str(path.with_name(f".{path.name}."))
+        if error.errno is not None and str(error.filename or beside).startswith(beside):
             error.filename = str(path)
         raise
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def require_writable(folder: Path) -> None:

@@ -26,6 +26,15 @@ def at_first_use(package: str, modules: Mapping[str, Sequence[str]]) -> Callable
     return attribute
 
 
+def at_first_call(module: str, name: str) -> Callable[..., Any]:
+    """A function that imports the one it stands for when it is called, such as a method that few programs call."""
+
+    def call(*arguments: Any) -> Any:
+        return getattr(importlib.import_module(module), name)(*arguments)
+
+    return call
+
+
 @contextmanager
 def without_collection() -> Iterator[None]:
     """Pause the collection of cyclic garbage while modules load, and exempt what they leave from later ones.

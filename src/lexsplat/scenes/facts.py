@@ -7,6 +7,7 @@ from typing import Any
 
 from lexsplat.geometry.world import world_of
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.unsaved import unsaved_steps
 
 NO_SEGMENTS = (
     "single Gaussians answer; lexsplat language CAPTURE --output SCENE, with the options of the build, adds segments"
@@ -62,6 +63,7 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),
         "language_bytes": folder.bytes_on_disk(folder.language_path),
         "code_map_bytes": folder.bytes_on_disk(folder.root / "codes"),
+        "unsaved_steps": unsaved_steps(folder),
         "warnings": len(record.get("warnings", [])),
         "lexsplat": record.get("provenance", {}).get("lexsplat"),
     }

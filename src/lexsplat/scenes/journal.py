@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from lexsplat.runtime.errors import FileFormatError, SceneFolderError
+from lexsplat.runtime.files import naming
 from lexsplat.scenes.filling import Fill
 from lexsplat.scenes.scene import Scene
 
@@ -139,7 +140,7 @@ class Journal:
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
         lines = [entry] if self._size else [self._header(), entry]
-        with open(self.path, "a", encoding="utf-8") as file:
+        with naming(self.path), open(self.path, "a", encoding="utf-8") as file:
             _lock(file)
             before = os.fstat(file.fileno()).st_size
             try:
@@ -155,18 +156,23 @@ class Journal:
                     self.path.unlink(missing_ok=True)
                 raise
 
+    @property
+    def is_unchanged(self) -> bool:
+        """Whether the file is as it was read or written here."""
+        return (self.path.stat().st_size if self.path.exists() else 0) == self._size
+
     def check_unchanged(self) -> None:
         """Refuse to go on after the steps of another program.
 
         Raises:
             SceneFolderError: If the file is not as it was read or written here.
         """
-        if (self.path.stat().st_size if self.path.exists() else 0) != self._size:
+        if not self.is_unchanged:
             raise SceneFolderError(
                 self.path,
                 expected="the steps as they were read",
                 found="steps of another program",
-                remedy="run the command again, or start lexsplat view again",
+                remedy="run the command again; in a page, try again",
             )
 
     def read(self) -> tuple[list[Step], list[Step]]:
@@ -201,7 +207,9 @@ class Journal:
 
     def _lines(self) -> list[str]:
         try:
-            content = self.path.read_bytes()
+            with open(self.path, "rb") as file:
+                _lock(file, shared=True)  # of another program's step, all is there or nothing
+                content = file.read()
             lines = content.decode("utf-8").split("\n")
         except (OSError, UnicodeDecodeError) as error:
             raise FileFormatError(
@@ -233,10 +241,10 @@ class Journal:
             )
 
 
-def _lock(file: IO[str]) -> None:
-    """Wait until no other program writes to a file; the lock ends when it is closed."""
+def _lock(file: IO[Any], shared: bool = False) -> None:
+    """Wait until no other program writes to a file, or reads it if not shared; the lock ends when it is closed."""
     try:
         import fcntl
     except ImportError:  # Windows has no flock: two writers at the same moment are not detected
         return
-    fcntl.flock(file, fcntl.LOCK_EX)
+    fcntl.flock(file, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)

@@ -46,6 +46,7 @@ from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.lazy import at_first_call
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.answers import Answers, Word, automatic_thresholds, in_own_words, of_kind, of_part
 from lexsplat.scenes.finding import find_in, understood_in
@@ -106,6 +107,8 @@ class Scene:
         place = f", folder={str(self.folder.root)!r}" if self.folder else ""
         return f"Scene(gaussians={len(self.gaussians)}, views={len(self.views)}, method={self.field.method!r}{place})"
 
+    _repr_html_ = at_first_call("lexsplat.scenes.notebook", "scene_html")
+
     @property
     def query(self) -> QueryConfig:
         """How text is compared with the scene."""
@@ -125,9 +128,8 @@ class Scene:
 
     def with_content(self, gaussians: Gaussians, field: LanguageField) -> Scene:
         """The same views and encoder with other Gaussians and their language, as after an edit."""
-        other = Scene(
-            gaussians, field, self.views, self.clip, self.query, self.folder, self.given_encode_text
-        )
+        same = self.views, self.clip, self.query, self.folder, self.given_encode_text
+        other = Scene(gaussians, field, *same)
         other.text_tower, other._cache, other._texts = self.text_tower, self._cache, self._texts
         other.listener = self.listener
         return other
@@ -437,9 +439,8 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
     """
     place = choose_device(device)
     if not isinstance(path, (str, os.PathLike)):
-        raise SceneFolderError(
-            repr(path)[:60], expected="the path of a scene folder", found=type(path).__name__
-        )
+        expected = "the path of a scene folder"
+        raise SceneFolderError(repr(path)[:60], expected=expected, found=type(path).__name__)
     found = read_scene(Path(path), place)
     built_with = present_name(found.folder.record.get("config", {}).get("clip", "bundled"))
     scene = Scene(found.gaussians, found.field, found.views, clip or built_with, found.query, found.folder)

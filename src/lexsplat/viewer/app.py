@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import io
 import json
@@ -34,8 +35,8 @@ def make_app(session: Session) -> Starlette:
     """The application; put a `lexsplat.viewer.guard.Guard` in front of it."""
     return Starlette(
         routes=[
-            Route("/", lambda _: HTMLResponse(folder_index(session.content.manifest))),
-            Route("/manifest.json", lambda _: JSONResponse(session.content.manifest)),
+            Route("/", lambda _: HTMLResponse(folder_index(_manifest(session)))),
+            Route("/manifest.json", lambda _: JSONResponse(_manifest(session))),
             Route("/photo/{number:int}", _photos(session)),
             _posted("/ask", session, lambda s, data: _bytes(s.ask(Asked.from_json(data)))),
             _posted("/click", session, lambda s, data: _bytes(s.what_is(Asked.from_json(data)))),
@@ -57,6 +58,13 @@ def make_app(session: Session) -> Starlette:
     )
 
 
+def _manifest(session: Session) -> dict[str, Any]:
+    """The manifest of the scene as it is now."""
+    with contextlib.suppress(LexsplatError, OSError):  # the first question reports it
+        session.catch_up()
+    return session.content.manifest
+
+
 def _posted(path: str, session: Session, work: Work) -> Route:
     """A path that answers a JSON object; work for different pages waits for each other."""
 
@@ -64,6 +72,7 @@ def _posted(path: str, session: Session, work: Work) -> Route:
         try:
             data = read_document(body)
             with session.lock:
+                session.catch_up()
                 if data.get("version") != session.version:
                     return JSONResponse({"version": session.version}, 409)  # the page shows an earlier scene
                 return work(session, data)

@@ -257,6 +257,35 @@ class Session:
                 found=error.strerror or str(error),
                 remedy="nothing was changed: make room and try again",
             ) from error
+        return self._show_prepared()
+
+    def catch_up(self) -> None:
+        """Show the steps that another program has kept or discarded meanwhile.
+
+        Raises:
+            FileFormatError: If they are damaged.
+            SceneFolderError: If they belong to another reconstruction.
+            QueryError: If the scene with them cannot be drawn.
+        """
+        if self._is_current:
+            return  # a page that loads does not wait for the work of another
+        with self.lock:
+            before = self.editor
+            if self._is_current or before.journal is None:
+                return
+            self.editor = Editor(before.original, before.journal.path, self._prepare)
+            try:
+                self._prepare()
+            except BaseException:
+                self.editor = before
+                raise
+            self._show_prepared()
+
+    @property
+    def _is_current(self) -> bool:
+        return self.editor.journal is None or self.editor.journal.is_unchanged
+
+    def _show_prepared(self) -> dict[str, Any]:
         self.content = self._prepared
         self.version = self.content.manifest["server"]["version"]
         return self.content.manifest

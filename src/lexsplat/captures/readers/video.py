@@ -48,6 +48,11 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()
 
 
+def videos_in(folder: Path) -> list[str]:
+    """Names of the videos in a folder, sorted."""
+    return sorted(path.name for path in folder.iterdir() if is_video(path))
+
+
 def require_video(video: Path, folder: Path) -> None:
     """Refuse a video that cannot be sampled into a folder, before anything takes time.
 

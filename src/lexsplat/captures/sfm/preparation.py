@@ -30,6 +30,7 @@ from lexsplat.captures.images.reading import (
     sizes_agree,
 )
 from lexsplat.captures.readers.camera_files import checked_name
+from lexsplat.captures.readers.video import videos_in
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path, link_or_copy
@@ -140,7 +141,7 @@ def prepare_photos(
     budget.check_photo(largest, memory)
     photos = _of_all(names, lambda name: _look_at(folder, name))
     largest = max((photo.size for photo in photos), key=lambda size: size[0] * size[1])
-    notes = _other_images(folder)
+    notes = [f"{folder}: {note}" for note in (*_left_out(folder), *_twins(names))]
     found, strays = find_ignore_masks(mask_places(folder), names)
     notes += strays
     images, renamed = folder, {name: name for name in names}
@@ -189,14 +190,34 @@ def _of_all(names: Sequence[str], look: Callable[[str], _Found]) -> list[_Found]
     return found
 
 
-def _other_images(folder: Path) -> list[str]:
-    """A note on image files of formats that are not read, if there are any."""
-    other = sorted(
-        path.name for path in folder.iterdir() if path.suffix.lower() in _NOT_READ and path.is_file()
-    )
-    some = ", ".join(other[:3]) + (" and more" if len(other) > 3 else "")
-    told = "is left out: its format is" if len(other) == 1 else "are left out: their formats are"
-    return [f"{folder}: {some} {told} not read; save as JPEG or PNG"] if other else []
+def _left_out(folder: Path) -> list[str]:
+    """A note on image files of formats that are not read, and one on videos, if there are any."""
+    other = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in _NOT_READ and p.is_file())
+    notes = []
+    if other:
+        told = "is left out: its format is" if len(other) == 1 else "are left out: their formats are"
+        notes.append(f"{_some(other)} {told} not read; save as JPEG or PNG")
+    if videos := videos_in(folder):
+        told = "is left out: a video is" if len(videos) == 1 else "are left out: videos are"
+        notes.append(f"{_some(videos)} {told} given by itself, without photos")
+    return notes
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (" and more" if len(names) > 3 else "")
+
+
+def _twins(names: Sequence[str]) -> list[str]:
+    """A note on photos that differ in their endings only, as phones export a photo in two formats."""
+    groups: dict[Path, list[str]] = {}
+    for name in names:
+        groups.setdefault(Path(name).with_suffix(""), []).append(name)
+    twins = [group for group in groups.values() if len(group) > 1]
+    if not twins:
+        return []
+    count = "1 pair" if len(twins) == 1 else f"{len(twins):,} pairs"
+    told = f"{count} of photos with one name and two endings, such as {' and '.join(twins[0][:2])}"
+    return [f"{told}: the same shot twice? Keep one of them"]
 
 
 def checked_photos(folder: Path, output: Path) -> list[str]:
@@ -214,11 +235,12 @@ def checked_photos(folder: Path, output: Path) -> list[str]:
         )
     names = find_photos(folder, output)
     if len(names) < 3:
+        videos = videos_in(folder)
         raise CaptureError(
             folder,
             expected="at least 3 photos",
-            found="; ".join([str(len(names)), *(note.partition(": ")[2] for note in _other_images(folder))]),
-            remedy="take 30 or more photos around the place",
+            found="; ".join([str(len(names)), *_left_out(folder)]),
+            remedy=f"give {folder / videos[0]}" if videos else "take 30 or more photos around the place",
         )
     for name in names:
         if not _can_be_listed(folder, name):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterable
 from functools import lru_cache
@@ -16,7 +17,10 @@ from lexsplat.queries.phrases import Thing
 from lexsplat.queries.relevancy import embed_prompts
 from lexsplat.runtime.errors import LexsplatError, QueryError
 from lexsplat.runtime.files import read_json
+from lexsplat.runtime.progress import NOTE
 from lexsplat.scenes.scene import Scene
+
+log = logging.getLogger("lexsplat")
 
 ASKED, NAME, COMBINED, USE = "a", "n", "c", "u"
 """Kinds of phrases: asked of this scene before; names, which answer "what is this?"; names with a color, material or
@@ -92,6 +96,27 @@ def asked_phrases(scene: Scene) -> list[str]:
     except LexsplatError:
         return []
     return [phrase for phrase in history if isinstance(phrase, str)]
+
+
+def offered_phrases(scene: Scene) -> dict[str, str]:
+    """The `page_phrases` of a scene; a note says how many were asked in the viewer, and in which file they are.
+
+    Those that the encoder would truncate are left out.
+    """
+    phrases = page_phrases(asked_phrases(scene), bundled=scene.clip == "bundled")
+    asked = [phrase for phrase, kind in phrases.items() if kind == ASKED]
+    if not asked or scene.folder is None:
+        return phrases
+    over = getattr(scene.preload(), "tokens_over", lambda _: 0)
+    long = [one for one in asked if any(over(form.replace("{}", one)) for form in scene.query.templates)]
+    for phrase in long:
+        del phrases[phrase]
+    count = len(asked) - len(long)
+    told = f"{count:,} phrase{' is' if count == 1 else 's are'} offered to visitors"
+    if long:
+        told += f", and {len(long):,} left out that the encoder would truncate"
+    log.log(NOTE, "%s: %s", scene.folder.root / "viewer.json", told)
+    return phrases
 
 
 @torch.no_grad()

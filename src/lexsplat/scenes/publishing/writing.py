@@ -14,7 +14,7 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.kinds import words_of_things
 from lexsplat.queries.scoring import form_used
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
-from lexsplat.runtime.files import read_json, write_json
+from lexsplat.runtime.files import naming, read_json, write_json
 from lexsplat.runtime.progress import Event
 from lexsplat.scenes.formats.language import stored_language
 from lexsplat.scenes.publishing.english import english_file
@@ -38,7 +38,7 @@ from lexsplat.scenes.publishing.sidecar import (
 )
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.text_tower import write_text_tower
-from lexsplat.scenes.publishing.vocabulary import asked_phrases, page_phrases, phrase_answers, words_file
+from lexsplat.scenes.publishing.vocabulary import offered_phrases, phrase_answers, words_file
 from lexsplat.scenes.scene import Scene
 
 MOST_SPLATS = 4_000_000
@@ -108,7 +108,7 @@ def publish(scene: Scene, target: Path, options: PublishOptions | None = None) -
     check_target(target, options.single_file)
     _check_scene(scene.gaussians, options.max_splats)
     target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as work:
+    with naming(target), tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as work:
         folder = Path(work) / "page"
         folder.mkdir()
         manifest = _write_content(scene, folder, options)
@@ -214,7 +214,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     objects = scene.objects[:MOST_OBJECTS]
     (folder / "objects.bin").write_bytes(objects_file(objects, kept))
     scene.listener(Event(_STAGE, 3, _STEPS))
-    phrases = page_phrases(asked_phrases(scene), bundled=scene.clip == "bundled")
+    phrases = offered_phrases(scene)
     tables, presences = phrase_answers(scene, list(phrases))
     (folder / "words.txt").write_bytes(words_file(phrases, presences))
     (folder / "words.bin").write_bytes(tables.numpy().tobytes())
