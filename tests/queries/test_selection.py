@@ -1,6 +1,7 @@
 """Sets of Gaussians: compared with sets of numbers, brute-force distances and balls at known places."""
 
 import operator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -140,6 +141,20 @@ def test_masks_of_another_scene_are_refused(balls):
     for combine in (operator.or_, operator.and_, operator.sub):
         with pytest.raises(ValueError, match="different scenes"):
             combine(ball(balls, 0), other)
+
+
+def test_as_many_gaussians_elsewhere_are_another_scene_and_other_colors_are_the_same(balls):
+    moved, painted = balls.gaussians.map(torch.clone), balls.gaussians.map(torch.clone)
+    moved.means[0] += 1
+    painted.sh0[0] += 1
+    assert bool(ball(balls, 0) | replace(ball(balls, 1), gaussians=painted))
+    with pytest.raises(ValueError, match="different scenes"):
+        ball(balls, 0) | replace(ball(balls, 1), gaussians=moved)
+
+
+def test_what_shrinks_to_nothing_is_not_there(balls):
+    assert ball(balls, 0).shrink(1e-3).present == "yes"
+    assert ball(balls, 0).shrink(100.0).present == "no"
 
 
 def test_a_selection_combines_with_selections_only(balls):

@@ -233,6 +233,13 @@ def test_a_refused_edit_leaves_the_scene_unchanged(base, tmp_path):
     editor.delete(choose(editor, 0))
     with pytest.raises(ValueError, match="select again"):
         editor.delete(old)
+    editor.undo()
+    editor.duplicate(choose(editor, 1), Motion((1.0, 0, 0)))
+    copied = choose(editor, 1)
+    editor.undo()
+    editor.duplicate(choose(editor, 1), Motion((-1.0, 0, 0)))  # as many Gaussians, at other places
+    with pytest.raises(ValueError, match="select again"):
+        editor.delete(copied)
 
 
 def test_a_step_that_cannot_be_journaled_is_not_done(base, tmp_path, monkeypatch):

@@ -23,9 +23,9 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.rotations import matrices_from_quaternions
 from lexsplat.geometry.world import World
+from lexsplat.queries.best_views import promising_views, visible_share
 from lexsplat.queries.clusters import LINK, clusters, spacing
 from lexsplat.queries.touching import divided
-from lexsplat.rendering import render
 from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.lazy import at_first_call
 
@@ -211,10 +211,15 @@ class Selection:
     def view_shares(self) -> list[tuple[str, float]]:
         """The views that show most of it and the share of the image it covers there, at most 8; best first."""
         if self.seen is not None and self:
-            found = self.seen.shares(self.indices, None if self.seen.complete else _promising_views(self))
-            return found if found and found[0][1] > 0 else [(name, 0.0) for name in _promising_views(self)]
-        shares = [(name, _visible_share(self, self.cameras[name])) for name in _promising_views(self)]
+            found = self.seen.shares(self.indices, None if self.seen.complete else promising_views(self))
+            return found if found and found[0][1] > 0 else [(name, 0.0) for name in promising_views(self)]
+        shares = [(name, visible_share(self, self.cameras[name])) for name in promising_views(self)]
         return sorted(shares, key=lambda entry: -entry[1])
+
+    def is_of(self, gaussians: Gaussians) -> bool:
+        """Whether it was made in a scene of these Gaussians, in any colors."""
+        own, others = self.gaussians.means, gaussians.means
+        return own is others or (own.shape == others.shape and torch.equal(own, others.to(own)))
 
     # -- making others from it
 
@@ -251,7 +256,8 @@ class Selection:
             return self
         reach = self._reach(distance)
         apart, _ = cKDTree(self._means()[outside]).query(self._means(), distance_upper_bound=reach)
-        return replace(self, mask=self.mask & ~self._tensor(np.isfinite(apart)))
+        mask = self.mask & ~self._tensor(np.isfinite(apart))
+        return replace(self, mask=mask, present=self.present if bool(mask.any()) else "no")
 
     def largest(self) -> Selection:
         """The largest instance; the selection itself if it is empty."""
@@ -340,7 +346,7 @@ class Selection:
     @cached_property
     def sample(self) -> NDArray[np.float64]:
         """Up to `_SAMPLE` of its points ``[M, 3]``, for distances and relations."""
-        points, _ = self._points()
+        points, _ = self.points
         return points[:: max(1, len(points) // _SAMPLE)]
 
     @cached_property
@@ -353,7 +359,7 @@ class Selection:
     ) -> Selection:
         if not isinstance(other, Selection):
             return NotImplemented
-        if len(self.mask) != len(other.mask):
+        if not self.is_of(other.gaussians):
             raise ValueError("the selections are of different scenes")
         mask = combine(self.mask, other.mask)
         scores = self.scores if word == "minus" else torch.maximum(self.scores, other.scores)
@@ -387,7 +393,8 @@ class Selection:
     def _tensor(self, array: NDArray[np.bool_]) -> Tensor:
         return torch.from_numpy(array).to(self.mask.device)
 
-    def _points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    @property
+    def points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centers ``[M, 3]`` and opacities ``[M]`` of the selected Gaussians."""
         means, logits = (
             each.detach()[self.indices] for each in (self.gaussians.means, self.gaussians.opacity_logits)
@@ -403,14 +410,14 @@ class Selection:
 
     def _spacing(self) -> float:
         """Median distance from a selected Gaussian to its sixth neighbor."""
-        points, _ = self._points()
+        points, _ = self.points
         if len(points) < 2:
             return float(self.gaussians.log_scales[self.indices].exp().max())
         return spacing(points)
 
     def _clusters(self) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Cluster of each selected Gaussian ``[M]`` and the total opacity of each cluster ``[C]``."""
-        points, opacities = self._points()
+        points, opacities = self.points
         firm = opacities >= FAINT
         counted = None if self.seen is None else self.seen.counted(self.indices)
         labels = divided(points, firm, clusters(points, firm, counted), self.up.direction)
@@ -423,31 +430,3 @@ def union(like: Tensor, parts: Iterable[Selection]) -> Tensor:
     for part in parts:
         mask[part.indices] = True
     return mask
-
-
-def _promising_views(selection: Selection) -> list[str]:
-    """The views in which the selection would be largest without occlusion."""
-    if not selection or not selection.cameras:
-        return []
-    points, weights = selection._points()
-    sizes = selection.gaussians.log_scales.detach()[selection.indices].exp().cpu().numpy()
-    areas = weights * np.sort(sizes, axis=1)[:, 1:].prod(1)
-    step = max(1, len(points) // 2048)
-    points, areas = points[::step], areas[::step]
-    found = []
-    for name, camera in selection.cameras.items():
-        _, depth, inside = camera.project(points)
-        scale = camera.K[0, 0] * camera.K[1, 1] / (camera.width * camera.height)
-        found.append(
-            (float((areas * inside / np.maximum(depth, 1e-6) ** 2).sum() * scale * inside.mean()), name)
-        )
-    found.sort(key=lambda entry: -entry[0])
-    return [name for size, name in found[:8] if size > 0] or [found[0][1]]
-
-
-@torch.no_grad()
-def _visible_share(selection: Selection, camera: Camera) -> float:
-    """Share of the image that the selection covers, with occlusion."""
-    small = camera.downscaled(max(1.0, max(camera.width, camera.height) / 120))
-    carried = selection.mask[:, None].float()
-    return float(render(selection.gaussians, small, features=carried, color=False).features.mean())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 from contextvars import ContextVar
 from functools import partial
@@ -26,6 +27,10 @@ def torch_threads(count: int) -> Iterator[None]:
 one_thread = partial(torch_threads, 1)
 """The last bit of a floating-point sum depends on the order of addition, which depends on the number of threads and
 on the load of the machine. One thread gives reproducible bits."""
+
+if hasattr(os, "register_at_fork"):
+    # The threads of torch do not survive a fork: an operation on several would wait for them without end.
+    os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
 
 _kernel_threads: ContextVar[int | None] = ContextVar("kernel_threads", default=None)
 

@@ -312,7 +312,7 @@ class Editor:
         return extend(chosen, self.scene.hidden, self.scene.field.segments).mask
 
     def _do(self, kind: Kind, chosen: Selection, fill: bool = False, **values: Any) -> None:
-        if len(chosen.mask) != len(self.scene.gaussians):
+        if not chosen.is_of(self.scene.gaussians):
             raise ValueError(
                 "the selection was made before the last edit: select again in the scene of the editor"
             )
