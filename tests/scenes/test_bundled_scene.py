@@ -62,6 +62,13 @@ def test_the_earlier_name_of_the_bundled_encoder_means_it_everywhere():
 def test_an_encoder_that_is_given_is_checked_when_the_scene_is_opened_wherever_it_lies(tmp_path):
     moved = shutil.copytree(BUNDLED_ENCODERS / "clip", tmp_path / "moved")
     assert open_scene("demo", clip=str(moved)).ask("red apple").presences == ("yes",)
+    copied = shutil.copytree(BUNDLED_SCENE, tmp_path / "scene")
+    record = json.loads((copied / "scene.json").read_text())
+    record["config"]["clip"] = str(moved)  # the same encoder under another name
+    (copied / "scene.json").write_text(json.dumps(record))
+    assert [each.phrase for each in open_scene(copied).objects] == [
+        each.phrase for each in open_scene("demo").objects
+    ]
     with pytest.raises(ModelError, match="expected the encoder that the scene was built with, found another"):
         open_scene("demo", clip=str(write_clip(tmp_path / "other")))
     with pytest.raises(ModelError, match="found no such folder"):

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lexsplat.features.hub import content_hash, model_folder, present_name
+from lexsplat.features.text import check_encoder
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField, field_from_tensors
 from lexsplat.queries.relevancy import QueryConfig
@@ -33,6 +35,23 @@ class SceneContent:
         if self.folder.record.get("config", {}).get("as_in_paper"):
             return QueryConfig(form="feature", fixed=True)
         return QueryConfig()
+
+    def encoder(self, given: str | None = None) -> str:
+        """Name or folder of the text encoder. With the files of the bundled one, it is the bundled one.
+
+        Args:
+            given: One to take, if it is the encoder of the build; None takes it from where the build found it.
+
+        Raises:
+            ModelError: If the given one cannot be found, or is another one.
+        """
+        built_with = present_name(self.folder.record.get("config", {}).get("clip", "bundled"))
+        name = present_name(given or built_with)
+        if (needed := self.folder.record["stages"].get("features", {}).get("clip_hash")) is None:
+            return name
+        if name != built_with:  # known words would be answered without the encoder
+            check_encoder(name, content_hash(model_folder(name, "clip"), "clip"), needed)
+        return name if needed != content_hash(model_folder("bundled", "clip"), "clip") else "bundled"
 
 
 def read_scene(path: Path, device: str) -> SceneContent:

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lexsplat.features.hub import content_hash, model_folder, present_name
+from lexsplat.features.hub import present_name
 from lexsplat.features.text import TextCache, TextTower, check_encoder, encode_each, load_text, texts_of_scene
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
@@ -442,9 +442,4 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
         expected = "the path of a scene folder"
         raise SceneFolderError(repr(path)[:60], expected=expected, found=type(path).__name__)
     found = read_scene(Path(path), place)
-    built_with = present_name(found.folder.record.get("config", {}).get("clip", "bundled"))
-    scene = Scene(found.gaussians, found.field, found.views, clip or built_with, found.query, found.folder)
-    needed = scene.encoder_identity().get("encoder_hash")
-    if needed and scene.clip != built_with:  # known words would be answered without the encoder
-        check_encoder(scene.clip, content_hash(model_folder(scene.clip, "clip"), "clip"), needed)
-    return scene
+    return Scene(found.gaussians, found.field, found.views, found.encoder(clip), found.query, found.folder)

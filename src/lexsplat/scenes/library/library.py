@@ -227,7 +227,7 @@ class Library:
     def _open(self, path: Path) -> Scene:
         """A scene that shares text embeddings and encoders with the others."""
         found = read_scene(path, self._device)
-        clip = found.folder.record.get("config", {}).get("clip", "bundled")
+        clip = found.encoder()
         known = found.folder.record["stages"].get("features", {}).get("clip_hash", "")
         encode = functools.partial(self.encode, known, clip)
         content = (found.gaussians, found.field, found.views, clip, found.query, found.folder)
