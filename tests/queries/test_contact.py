@@ -53,6 +53,7 @@ def room(rng):
         "mug": block(rng, (-0.2, 0.2), (-0.2, 0.2), (0.02, 0.45), 600),
         "ring": ring + np.array([1.2, -0.6, 0.0]),
         "banana": block(rng, (-0.3, 0.3), (-0.8, -0.7), (0.0, 0.15), 400),  # in front of the cloth
+        "crate": block(rng, (-1.08, -0.5), (0.27, 0.77), (0.0, 0.45), 800),  # over a corner of the cloth
         "bottle": block(rng, (-1.7, -1.5), (0.75, 0.95), (0.0, 0.7), 400),  # near the edge
         "lamp": np.concatenate(  # the shade; its stem belongs to nothing
             [block(rng, (1.0, 1.4), (0.1, 0.5), (0.5, 0.95), 500), rng.normal((1.2, 0.3, 0.6), 0.02, (5, 3))]
@@ -101,13 +102,13 @@ ON = [
     ("ring", "table"), ("cloth", "table"), ("mug", "cloth"), ("mug", "table"), ("banana", "table"),
     ("bottle", "table"), ("lamp", "table"), ("table", "floor"), ("dog", "floor"), ("chest", "floor"),
     ("ball", "floor"), ("picture", "wall"), ("picture", "walls"), ("bird", "wall"), ("bear", "seat"),
-    ("seat", "floor"),
+    ("seat", "floor"), ("crate", "table"),
 ]  # fmt: skip
 NOT_ON = [
     ("table", "ring"), ("table", "cloth"), ("cloth", "mug"), ("banana", "cloth"), ("mug", "floor"),
     ("balloon", "table"), ("lamp", "wall"), ("bottle", "wall"), ("table", "wall"), ("chest", "wall"),
     ("ball", "walls"), ("chest", "walls"), ("wall", "picture"), ("dog", "table"), ("ring", "cloth"), ("seat", "bear"),
-    ("ring", "floor"), ("cloth", "floor"),
+    ("ring", "floor"), ("cloth", "floor"), ("crate", "cloth"),
 ]  # fmt: skip
 UNDER = [
     ("table", "ring"), ("table", "mug"), ("cloth", "mug"), ("floor", "table"), ("dog", "table"), ("table", "balloon"),
