@@ -58,6 +58,7 @@ def test_segment_features_become_maps_and_levels_are_averaged(capture, tmp_path)
 @pytest.mark.parametrize(
     ("array", "message"),
     [
+        (np.zeros((4, 4, 3)), "expected features, found zeros alone"),
         (np.zeros((4, 4)), r"expected features \[h, w, D\]"),
         (np.full((2, 2, 3), np.nan), "NaN"),
         (np.zeros((2, 2, 3), "U1"), "array of numbers"),

@@ -205,7 +205,7 @@ class _Reading:
         total = np.empty((*index.shape[1:], unit.shape[1]), np.float32)
         for row in range(len(total)):
             total[row] = padded[index[:, row]].sum(0)
-        return FeatureMap(_unit(total, path))
+        return FeatureMap(_unit(total, path, holes=True))
 
     def open_segments(self, path: Path) -> tuple[NDArray, NDArray]:
         """Features of segments ``[n, D]``, and the segments of the pixels ``[h, w]`` or ``[L, h, w]``, mapped."""
@@ -295,8 +295,11 @@ def wrong(
     return FileFormatError(path, expected=expected, found=str(found)[:200], remedy=remedy)
 
 
-def _unit(array: NDArray, path: Path) -> torch.Tensor:
-    """Unit vectors ``[h, w, D]`` in float32; normalizes in place if the array is float32 already."""
+def _unit(array: NDArray, path: Path, *, holes: bool = False) -> torch.Tensor:
+    """Unit vectors ``[h, w, D]`` in float32; normalizes in place if the array is float32 already.
+
+    With ``holes``, all of them may be zero: a photo without segments.
+    """
     if 0 in array.shape:
         raise wrong(path, "features [h, w, D]", list(array.shape))
     with np.errstate(over="ignore"):  # overflow becomes infinity, which is refused below
@@ -304,4 +307,6 @@ def _unit(array: NDArray, path: Path) -> torch.Tensor:
     lengths = torch.linalg.vector_norm(values, dim=-1, keepdim=True)
     if not bool(torch.isfinite(lengths).all()):
         raise wrong(path, "finite numbers", "NaN, infinity, or values beyond 1e19")
+    if not holes and not bool(lengths.any()):
+        raise wrong(path, "features", "zeros alone")
     return values.div_(lengths.clamp_min(1e-12))

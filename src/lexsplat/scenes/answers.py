@@ -128,7 +128,8 @@ class Answers:
         if self.automatic:
             selection = selection.convincing(self.words[index].own if self.words else None)
         shown = without_hidden(selection, self.scene.hidden)
-        return replace(shown, note="no photo shows what fits") if selection and not shown else shown
+        unseen = selection and not shown and present != "no"
+        return replace(shown, note="no photo shows what fits") if unseen else shown
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON: ``{"answers": [...]}``, each as `Selection.to_dict`."""
