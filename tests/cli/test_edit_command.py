@@ -215,11 +215,8 @@ def with_a_step(built, tmp_path, capsys):
     [
         ["export", "SCENE", "OUT.ply"],
         ["export", "SCENE", "OUT.ply", "--select", "blue ball", "--threshold", "0.05"],
-        ["publish", "SCENE", "OUT", "--words-only"],
         ["find", "SCENE", "blue ball", "--json"],
-        ["query", "SCENE", "blue ball", "--no-images", "--json"],
         ["ask", "SCENE", "blue ball"],
-        ["list", "SCENE", "--json"],
     ],
 )
 def test_a_command_that_reads_a_scene_notes_once_that_steps_are_not_in_it(

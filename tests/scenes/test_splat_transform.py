@@ -6,6 +6,7 @@ the Gaussians themselves and the PLY that splat-transform writes, read by plyfil
 
 from __future__ import annotations
 
+import functools
 import shutil
 import subprocess
 from pathlib import Path
@@ -49,6 +50,7 @@ THEIRS = {
 """Formats that splat-transform writes."""
 
 
+@functools.cache
 def program() -> str | None:
     """splat-transform, if it is there and runs."""
     found = shutil.which("splat-transform")
