@@ -6,7 +6,7 @@ import torch
 
 from lexsplat.language.segment_codes import SegmentCodes, segment_codes
 from lexsplat.language.segments import Segments
-from lexsplat.queries.colors import color_words
+from lexsplat.queries.colors import COLOR_WORDS, NEAR, cielab, color_told, color_words, may_be
 from lexsplat.queries.objects import name_probabilities, whole_segments
 
 LEVELS = torch.tensor([[0, 1, 2, 3, 4], [0, 0, 1, 2, 3], [0, 0, 1, 2, 2]])
@@ -104,3 +104,20 @@ def test_well_known_colors_have_their_names(word, names):
     for name in names.split():
         color = [int(name[place : place + 2], 16) / 255 for place in (1, 3, 5)]
         assert color_words(np.array([color]), np.ones(1)) == [word], name
+
+
+def test_cielab_is_that_of_scikit_image():
+    rgb2lab = pytest.importorskip("skimage.color").rgb2lab
+    colors = np.concatenate([np.random.default_rng(0).random((500, 3)), np.eye(3), [[0, 0, 0], [1, 1, 1]]])
+    np.testing.assert_allclose(cielab(colors), rgb2lab(colors), atol=1e-3)
+
+
+def test_a_thing_may_have_a_color_that_light_or_shade_turns_into_another_one():
+    assert {word for pair in NEAR for word in pair.split()} == set(COLOR_WORDS)
+    assert may_be({"white"}, {"gray"})
+    assert may_be({"gray"}, {"red", "white"})
+    assert not may_be({"blue"}, {"brown", "white"})
+    assert not may_be({"yellow"}, {"red"})
+    assert (color_told("Grey mug"), color_told("orange"), color_told("red and white cloth")) == (
+        {"gray"}, set(), {"red", "white"},
+    )  # fmt: skip

@@ -20,10 +20,10 @@ from lexsplat.features.encoders import load_clip
 from lexsplat.features.hub import BUNDLED_ENCODERS
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import ModelError, SceneFolderError
-from lexsplat.scenes.answers import Word, of_part
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.records import read_record
 from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.words import Word, of_part
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +108,22 @@ def test_a_part_that_several_objects_have_is_that_of_each(demo):
     assert torch.equal(found.scores, torch.stack(held).amax(0))
     absent = Word(scores, scores, "no")
     assert of_part(demo, "handle", absent) is absent
+
+
+@pytest.mark.parametrize(
+    ("phrase", "present"),
+    [
+        ("brown teddy bear", "yes"),
+        ("blue teddy bear", "unsure"),  # language says yes
+        ("red apple", "yes"),
+        ("yellow apple", "unsure"),  # the banana
+        ("white vase", "yes"),
+        ("green vase", "unsure"),  # the bottle
+        ("gray vase", "yes"),  # white in shade
+    ],
+)
+def test_a_thing_is_certainly_in_a_color_only_if_its_pixels_are(demo, phrase, present):
+    assert demo.ask(phrase).presences == (present,)
 
 
 def test_single_gaussians_and_the_form_of_the_paper_cut_no_parts(demo):

@@ -31,6 +31,10 @@ export class Grammar {
     return found?.index === 0 ? found : null;
   }
 
+  list(kind: string): string[] {
+    return [...this.#words[kind]];
+  }
+
   has(kind: string, word: string): boolean {
     return this.#words[kind].has(word.toLowerCase());
   }

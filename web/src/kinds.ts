@@ -20,6 +20,10 @@ export class Kinds {
     this.#objects = objects;
   }
 
+  get names(): string[] {
+    return this.#objects.map(({ name }) => name);
+  }
+
   has(kind: string): boolean {
     return this.#members.has(kind);
   }
@@ -42,12 +46,11 @@ export class Kinds {
     return { scores, presence: "yes", members: places, places, note: names.join(", ") };
   }
 
-  /** The names of the objects that each have at least this share of some splats. */
-  holding(splats: number[], share: number): string[] {
+  /** The objects that each have at least this share of some splats. */
+  holding(splats: number[], share: number): ObjectEntry[] {
     const counts = this.#objects.map(() => 0);
     for (const i of splats) if (this.content[i] < counts.length) counts[this.content[i]]++;
-    const held = this.#objects.filter((_, place) => splats.length > 0 && counts[place] >= share * splats.length);
-    return [...new Set(held.map(({ name }) => name))];
+    return this.#objects.filter((_, place) => splats.length > 0 && counts[place] >= share * splats.length);
   }
 
   #found(): Place[] {

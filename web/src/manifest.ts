@@ -139,6 +139,8 @@ export interface ObjectEntry {
   size: [number, number, number];
   /** Color words, the most frequent first; only in pages without a server. */
   colors?: string[];
+  /** Every color that it is seen in. */
+  seen_colors?: string[];
 }
 
 export interface Manifest {

@@ -177,15 +177,30 @@ export class Tables implements Source {
     if (!this.segments || presence === "no") return { scores: own, own, presence, threshold };
     const whole = this.segments.scores(own);
     if (!this.cuts) return { scores: whole, own, presence, threshold };
-    if (isPartAlone(phrase, this.cuts.words)) {
-      return { scores: whole, own, ...(await this.#ofObjects(phrase, whole, this.segments, this.cuts.held)), presence, threshold };
-    }
-    return { scores: (await this.#cut(phrase, own, whole, this.segments, this.cuts)) ?? whole, own, presence, threshold };
+    const { words, held } = this.cuts;
+    const parts = isPartAlone(phrase, words) ? await this.#ofObjects(phrase, whole, this.segments, held) : null;
+    const scores = parts?.scores ?? (await this.#cut(phrase, own, whole, this.segments, this.cuts)) ?? whole;
+    const seen = this.#hasColor(phrase, this.#seen(scores, threshold, this.segments), held);
+    return { scores, own, ...parts, presence: presence === "yes" && !seen ? ("unsure" as const) : presence, threshold };
+  }
+
+  /** Whether what is selected may have the color and the name that a phrase tells of it; true if no color is told or known. */
+  #hasColor(phrase: string, splats: number[], share: number): boolean {
+    const { grammar } = this.dictionary;
+    const told = phrase.toLowerCase().replace("grey", "gray").split(" ").slice(0, -1).filter((word) => grammar.has("told_colors", word));
+    const holding = this.kinds.holding(splats, share);
+    const seen = holding.flatMap((entry) => entry.seen_colors ?? []);
+    if (told.length === 0 || seen.length === 0) return true;
+    const isNamed = (name: string): boolean => name.split(" ").at(-1) === phrase.toLowerCase().split(" ").at(-1);
+    if (this.kinds.names.some(isNamed) && !holding.some(({ name }) => isNamed(name))) return false;
+    const pairs = [...told.map((color) => [color, color]), ...grammar.list("near_colors").map((pair) => pair.split(" "))];
+    return pairs.some(([a, b]) => (told.includes(a) && seen.includes(b)) || (told.includes(b) && seen.includes(a)));
   }
 
   /** A part without its thing, as that part of each object that has much of what its name selects; null if none has it. */
   async #ofObjects(part: string, whole: Float32Array, segments: Segments, share: number) {
-    const names = this.kinds.holding(this.#seen(whole, this.geometry.rule.threshold, segments), share);
+    const holding = this.kinds.holding(this.#seen(whole, this.geometry.rule.threshold, segments), share);
+    const names = [...new Set(holding.map(({ name }) => name))];
     const found: Answer[] = [];
     for (const name of names) {
       const answer = await this.#plain(`${name} ${part}`, part, "");

@@ -1,4 +1,4 @@
-"""Color words for a set of Gaussians."""
+"""Color words for a set of Gaussians, and which words light and shade turn into which."""
 
 from __future__ import annotations
 
@@ -16,29 +16,59 @@ _EXAMPLES = (
 """sRGB of words, in 0..255, in light and in shade; blues and purples also vivid ones."""
 COLOR_WORDS = tuple(dict.fromkeys(word for word, _ in _EXAMPLES))
 """Every color that `color_words` can tell."""
+_XYZ = np.array(
+    [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
+)
+_DAYLIGHT = np.array([0.95047, 1.0, 1.08883])
 _LIGHTNESS = 0.5
 """Weight of the difference of lightness; that of hue and chroma is 1. Shading changes lightness most."""
+NEAR = (
+    "white gray", "white yellow", "gray black", "red pink", "red orange", "red brown", "orange yellow",
+    "orange brown", "yellow brown", "yellow green", "green blue", "blue purple", "purple pink", "brown black",
+)  # fmt: skip
+"""Pairs of colors of which one may be seen as the other in another light."""
+SEEN = 0.1
+"""A thing is seen in a color that has this share of its visible weight."""
 _LEAST = 0.2
 """A word stands for at least this share of the visible weight, except for the first word."""
 
 
 def color_words(colors: NDArray[np.float64], weights: NDArray[np.float64]) -> list[str]:
-    """The words nearest in CIELAB to most of the colors, at most two, the more frequent first.
+    """The words nearest in CIELAB to most of the colors, at most two, the more frequent first; see `color_shares`."""
+    first, *others = sorted(color_shares(colors, weights).items(), key=lambda entry: -entry[1])
+    return [first[0], *(word for word, share in others[:1] if share >= _LEAST)]
+
+
+def color_shares(colors: NDArray[np.float64], weights: NDArray[np.float64]) -> dict[str, float]:
+    """The share of the weight of the colors that are nearest to each word, in 0..1.
 
     Args:
         colors: sRGB ``[M, 3]`` in 0..1, M > 0.
         weights: Weight of each color ``[M]``, not negative.
     """
-    from skimage.color import rgb2lab  # a second of imports that questions without colors do not wait for
-
     scale = np.array([_LIGHTNESS, 1.0, 1.0])
-    known = rgb2lab(np.array([example for _, example in _EXAMPLES], float) / 255) * scale
+    known = cielab(np.array([example for _, example in _EXAMPLES], float) / 255) * scale
     places = np.array([COLOR_WORDS.index(word) for word, _ in _EXAMPLES])
-    apart = np.linalg.norm((rgb2lab(np.clip(colors, 0, 1)) * scale)[:, None] - known, axis=-1)
-    shares = np.bincount(places[apart.argmin(1)], weights, len(COLOR_WORDS)) / max(
-        float(weights.sum()), 1e-12
-    )
-    order = np.argsort(-shares, kind="stable")[:2]
-    return [
-        COLOR_WORDS[place] for number, place in enumerate(order) if number == 0 or shares[place] >= _LEAST
-    ]
+    apart = np.linalg.norm((cielab(np.clip(colors, 0, 1)) * scale)[:, None] - known, axis=-1)
+    shares = np.bincount(places[apart.argmin(1)], weights, len(COLOR_WORDS))
+    return dict(zip(COLOR_WORDS, (shares / max(float(weights.sum()), 1e-12)).tolist()))
+
+
+def cielab(colors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """CIELAB of sRGB ``[..., 3]`` in 0..1, for daylight (D65). The import of scikit-image takes a second."""
+    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    x, y, z = np.moveaxis(linear @ _XYZ.T / _DAYLIGHT, -1, 0)
+    x, y, z = (np.where(v > 216 / 24389, np.cbrt(v), (24389 / 27 * v + 16) / 116) for v in (x, y, z))
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
+
+
+def color_told(phrase: str) -> set[str]:
+    """The colors that a phrase tells of a thing: "red" of "red mug", but not that of an orange."""
+    before = phrase.lower().replace("grey", "gray").split()[:-1]
+    return set(before) & set(COLOR_WORDS)
+
+
+def may_be(told: set[str], seen: set[str]) -> bool:
+    """Whether one of the colors that are told is among those that are seen, or near one."""
+    pairs = [set(pair.split()) for pair in NEAR]
+    return bool(told & seen) or any(pair & told and pair & seen for pair in pairs)

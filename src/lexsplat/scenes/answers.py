@@ -16,8 +16,7 @@ from torch import Tensor
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.grammar import understand, undetermined
 from lexsplat.queries.heatmaps import overlay_heatmap
-from lexsplat.queries.kinds import is_kind, is_of_kind, with_unknown_words
-from lexsplat.queries.parts import FEWEST, HELD, part_scores, with_parts
+from lexsplat.queries.kinds import with_unknown_words
 from lexsplat.queries.phrases import Thing, Understood
 from lexsplat.queries.relevancy import check_prompts, render_relevancy
 from lexsplat.queries.scoring import form_used
@@ -25,38 +24,18 @@ from lexsplat.queries.selection import Presence, Selection
 from lexsplat.queries.spelling import singular
 from lexsplat.queries.thresholds import BORDER, scene_thresholds
 from lexsplat.queries.visibility import without_hidden
-from lexsplat.queries.vocabulary import STUFF, is_part_alone, thing_of_part
+from lexsplat.queries.vocabulary import STUFF
 from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.progress import Event
 from lexsplat.runtime.sampling import evenly
+from lexsplat.scenes.words import Word, members_of_kind
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
 
 MAX_DEFAULT_VIEWS = 6
 """Number of held-out views that a query without ``--view`` renders, at most."""
-
-
-@dataclass(eq=False)
-class Word:
-    """Cached answers to one prompt.
-
-    Args:
-        scores: Relevancy of every Gaussian ``[N]`` in 0..1, in the form of the query.
-        own: The same for each Gaussian by itself ``[N]``.
-        presence: Whether the scene holds it, as if its words were known.
-        threshold: The automatic threshold; None until it is asked for.
-        selection: The selection of that threshold; None until it is asked for.
-        note: A remark on how it is answered; "" if there is none.
-    """
-
-    scores: Tensor
-    own: Tensor
-    presence: Presence
-    threshold: float | None = None
-    selection: Selection | None = None
-    note: str = ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -121,7 +100,7 @@ class Answers:
         if phrase.lower().split()[-1] in STUFF:
             seen = replace(selection, mask=self.chosen(index))
             return replace(seen, parts=(seen,)) if seen else seen
-        if present == "yes" and (members := _members(self.scene, phrase)):
+        if present == "yes" and (members := members_of_kind(self.scene, phrase)):
             known = (each.within(selection.mask) for each in members)
             return replace(selection, parts=tuple(each.described(scores=scores) for each in known if each))
         selection = selection.without_specks()
@@ -151,56 +130,6 @@ def automatic_thresholds(scene: Scene, words: Mapping[str, Word]) -> list[float]
         training or list(scene.cameras.values()),
         [word.presence for word in words.values()],
     ).tolist()
-
-
-def of_kind(scene: Scene, prompt: str, word: Word) -> Word:
-    """The word as it is, or with the objects of its kind ("toy") if the scene has any (`lexsplat.queries.kinds`)."""
-    members = _members(scene, prompt)
-    if not members:
-        return word
-    taken = torch.stack([each.mask for each in members]).any(0)
-    # Members reach the border, and all others stay below it.
-    inside, outside = word.scores.clamp(min=BORDER), word.scores.clamp(max=BORDER - 1e-4)
-    return replace(word, scores=torch.where(taken, inside, outside), presence="yes")
-
-
-def _members(scene: Scene, prompt: str) -> list[Selection]:
-    """The objects of the kind that a prompt names; none where it names no kind."""
-    if scene.query.fixed or not is_kind(prompt):
-        return []
-    return [each for each in scene.objects if is_of_kind(each.phrase, prompt)]
-
-
-def of_part(scene: Scene, prompt: str, word: Word) -> Word:
-    """The word as it is, or cut within its thing if it names a part of one (`lexsplat.queries.parts`)."""
-    segments = scene.field.segments
-    if word.presence == "no" or form_used(scene.field, scene.query) != "segment" or not segments:
-        return word
-    taken = (word.scores >= BORDER) & ~scene.hidden
-    if is_part_alone(prompt):
-        return _of_objects(scene, prompt, word, taken)
-    name = thing_of_part(prompt)
-    if not name:
-        return word
-    found = scene.ask(name)
-    thing = found.chosen(0)
-    if found.presences[0] == "no" or int(thing.sum()) < FEWEST:
-        return word
-    thing = with_parts(thing, taken, scene.gaussians, segments.labels)
-    scores = part_scores(word.own, thing, scene.gaussians, segments.masses)
-    return word if scores is None else replace(word, scores=scores)
-
-
-def _of_objects(scene: Scene, part: str, word: Word, taken: Tensor) -> Word:
-    """A part without its thing as that part of each object that has much of what its name selects: "mug handle"."""
-    least = HELD * max(int(taken.sum()), 1)
-    named = {each.phrase: each for each in scene.objects if int((taken & each.mask).sum()) >= least}
-    found = scene.ask([f"{name} {part}" for name in named], checked=True) if named else ()
-    held = [each for each, here in zip(found.words, found.presences) if here != "no"] if found else []
-    if not held:
-        return word
-    scores, own = (torch.stack(rows).amax(0) for rows in zip(*((each.scores, each.own) for each in held)))
-    return replace(word, scores=scores, own=own, note=f"the {part} of the {' and the '.join(named)}")
 
 
 def answer_queries(

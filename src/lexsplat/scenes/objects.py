@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from lexsplat.queries.colors import color_words
 from lexsplat.queries.objects import name_probabilities, whole_segments
 from lexsplat.queries.relations import same
 from lexsplat.queries.relevancy import check_prompts
@@ -21,7 +20,7 @@ from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.answers import rests_on
 from lexsplat.scenes.facts import NO_SEGMENTS
-from lexsplat.scenes.formats.tables import colors_of
+from lexsplat.scenes.words import object_colors, shown_weights
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -121,14 +120,8 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     return tuple(sorted(found, key=lambda each: -float(segments.masses[each.indices].sum())))
 
 
-def _shown(scene: Scene) -> torch.Tensor:
-    """Visible weight of each Gaussian in the training views ``[N]``; its opacity if that is not known."""
-    segments = scene.field.segments
-    return scene.gaussians.opacities.detach() if segments is None else segments.masses
-
-
 def _mean_codes(scene: Scene, thing: Selection) -> torch.Tensor:
-    weights, field = _shown(scene)[thing.indices], scene.field.select(thing.indices)
+    weights, field = shown_weights(scene)[thing.indices], scene.field.select(thing.indices)
     shares = weights / weights.sum().clamp_min(1e-12)
     return torch.from_numpy(field.sums(torch.zeros_like(thing.indices), shares, 1)[0]).to(shares)
 
@@ -155,12 +148,6 @@ def list_document(
         "picture": None if picture is None else str(picture),
         "objects": [_entry(scene, thing) for thing in things],
     }
-
-
-def object_colors(scene: Scene, thing: Selection) -> list[str]:
-    """The color words of an object, the most frequent first (`lexsplat.queries.colors`)."""
-    colors = colors_of(thing.selected).astype(np.float64) / 255
-    return color_words(colors, _shown(scene)[thing.indices].double().cpu().numpy())
 
 
 def _entry(scene: Scene, thing: Selection) -> dict[str, Any]:

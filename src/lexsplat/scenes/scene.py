@@ -48,12 +48,13 @@ from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.lazy import at_first_call
 from lexsplat.runtime.progress import Listener, silent
-from lexsplat.scenes.answers import Answers, Word, automatic_thresholds, in_own_words, of_kind, of_part
+from lexsplat.scenes.answers import Answers, automatic_thresholds, in_own_words
 from lexsplat.scenes.finding import find_in, understood_in
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder, StoredView, view_named
 from lexsplat.scenes.kept import KeptObjects, kept_objects_of, seen_of
 from lexsplat.scenes.objects import objects_of
 from lexsplat.scenes.reading import read_scene
+from lexsplat.scenes.words import Word, with_objects
 
 _KEPT_BYTES = 128 << 20
 """Memory for the scores and selections of words that were asked, at most; 32 words are kept in any case."""
@@ -380,7 +381,7 @@ class Scene:
         formed = scores_in_form(self.field, self.query, scores, presences)
         # Copies: a row would keep the scores of all prompts asked with it.
         words = [Word(row.clone(), own.clone(), here) for row, own, here in zip(formed, scores, presences)]
-        return [of_part(self, p, of_kind(self, p, word)) for p, word in zip(prompts, words)]
+        return [with_objects(self, prompt, word) for prompt, word in zip(prompts, words)]
 
     # -- views
 

@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 from lexsplat.queries import leftovers, patterns, questions
-from lexsplat.queries.colors import COLOR_WORDS
+from lexsplat.queries.colors import COLOR_WORDS, NEAR
 from lexsplat.queries.kinds import KIND_PHRASES
 from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES
 
@@ -39,6 +39,7 @@ def page_grammar() -> dict[str, Any]:
             "numbers": list(leftovers.NUMBERS),
             "colors": sorted(COLORS),
             "told_colors": list(COLOR_WORDS),
+            "near_colors": list(NEAR),
             "qualities": sorted(QUALITIES),
             "patterns": sorted(patterns.PATTERNS),
             "kinds": list(KIND_PHRASES),

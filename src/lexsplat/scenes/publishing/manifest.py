@@ -14,10 +14,10 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.kinds import KIND_PHRASES, is_of_kind
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.vocabulary import SURFACES
-from lexsplat.scenes.objects import object_colors
 from lexsplat.scenes.publishing.grammar import page_grammar
 from lexsplat.scenes.publishing.sidecar import selection_rule
 from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.words import object_colors, seen_colors
 
 FORMAT, FORMAT_VERSION = "lexsplat-page", 7
 DRAWN_SPLATS = 1_000_000
@@ -97,9 +97,11 @@ def object_entries(objects: Sequence[Selection]) -> list[dict[str, Any]]:
 
 
 def colored_entries(scene: Scene, objects: Sequence[Selection]) -> list[dict[str, Any]]:
-    """`object_entries` with "colors": the color words of each object, the most frequent first."""
-    entries = zip(object_entries(objects), objects)
-    return [{**entry, "colors": object_colors(scene, each)} for entry, each in entries]
+    """`object_entries` with "colors", the color words of each object, the most frequent first, and "seen_colors"."""
+    return [
+        {**entry, "colors": object_colors(scene, each), "seen_colors": seen_colors(scene, each)}
+        for entry, each in zip(object_entries(objects), objects)
+    ]
 
 
 def kind_entries(objects: Sequence[Selection]) -> dict[str, list[int]]:

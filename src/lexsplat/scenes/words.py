@@ -1,0 +1,148 @@
+"""What one prompt selects, where the objects of the scene know more than its relevancy.
+
+A kind such as "toy" is its members (`lexsplat.queries.kinds`), a part is cut within its thing
+(`lexsplat.queries.parts`), and a thing in a color has that color in its pixels (`lexsplat.queries.colors`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lexsplat.queries.colors import SEEN, color_shares, color_told, color_words, may_be
+from lexsplat.queries.kinds import is_kind, is_of_kind
+from lexsplat.queries.parts import FEWEST, HELD, part_scores, with_parts
+from lexsplat.queries.scoring import form_used
+from lexsplat.queries.selection import Presence, Selection
+from lexsplat.queries.thresholds import BORDER
+from lexsplat.queries.vocabulary import is_part_alone, thing_of_part
+from lexsplat.scenes.formats.tables import colors_of
+
+if TYPE_CHECKING:
+    from lexsplat.scenes.scene import Scene
+
+
+@dataclass(eq=False)
+class Word:
+    """Cached answers to one prompt.
+
+    Args:
+        scores: Relevancy of every Gaussian ``[N]`` in 0..1, in the form of the query.
+        own: The same for each Gaussian by itself ``[N]``.
+        presence: Whether the scene holds it, as if its words were known.
+        threshold: The automatic threshold; None until it is asked for.
+        selection: The selection of that threshold; None until it is asked for.
+        note: A remark on how it is answered; "" if there is none.
+    """
+
+    scores: Tensor
+    own: Tensor
+    presence: Presence
+    threshold: float | None = None
+    selection: Selection | None = None
+    note: str = ""
+
+
+def with_objects(scene: Scene, prompt: str, word: Word) -> Word:
+    """The answer to a prompt, given its relevancy and its presence by language."""
+    return of_color(scene, prompt, of_part(scene, prompt, of_kind(scene, prompt, word)))
+
+
+def of_kind(scene: Scene, prompt: str, word: Word) -> Word:
+    """The word as it is, or with the objects of its kind ("toy") if the scene has any (`lexsplat.queries.kinds`)."""
+    members = members_of_kind(scene, prompt)
+    if not members:
+        return word
+    taken = torch.stack([each.mask for each in members]).any(0)
+    # Members reach the border, and all others stay below it.
+    inside, outside = word.scores.clamp(min=BORDER), word.scores.clamp(max=BORDER - 1e-4)
+    return replace(word, scores=torch.where(taken, inside, outside), presence="yes")
+
+
+def members_of_kind(scene: Scene, prompt: str) -> list[Selection]:
+    """The objects of the kind that a prompt names; none where it names no kind."""
+    if scene.query.fixed or not is_kind(prompt):
+        return []
+    return [each for each in scene.objects if is_of_kind(each.phrase, prompt)]
+
+
+def of_part(scene: Scene, prompt: str, word: Word) -> Word:
+    """The word as it is, or cut within its thing if it names a part of one (`lexsplat.queries.parts`)."""
+    segments = scene.field.segments
+    if word.presence == "no" or form_used(scene.field, scene.query) != "segment" or not segments:
+        return word
+    taken = (word.scores >= BORDER) & ~scene.hidden
+    if is_part_alone(prompt):
+        return _of_objects(scene, prompt, word, taken)
+    name = thing_of_part(prompt)
+    if not name:
+        return word
+    found = scene.ask(name)
+    thing = found.chosen(0)
+    if found.presences[0] == "no" or int(thing.sum()) < FEWEST:
+        return word
+    thing = with_parts(thing, taken, scene.gaussians, segments.labels)
+    scores = part_scores(word.own, thing, scene.gaussians, segments.masses)
+    return word if scores is None else replace(word, scores=scores)
+
+
+def of_color(scene: Scene, prompt: str, word: Word) -> Word:
+    """The word as it is, or "unsure" where what it selects has another color than the prompt tells, or another name.
+
+    Encoders take a thing for the same thing in another color, whose pixels tell the difference, or another thing of
+    that color for it: a banana for a yellow apple, in a scene with a red one.
+    """
+    told = color_told(prompt)
+    if not told or word.presence != "yes" or form_used(scene.field, scene.query) != "segment":
+        return word
+    taken = (word.scores >= BORDER) & ~scene.hidden
+    held, name = holding(scene, taken), prompt.lower().split()[-1]
+    named = [each for each in scene.objects if each.phrase.split()[-1] == name]
+    if named and held and not any(each is other for each in held for other in named):
+        return replace(word, presence="unsure")
+    seen = {color for each in held for color in seen_colors(scene, each)}
+    return replace(word, presence="unsure") if seen and not may_be(told, seen) else word
+
+
+def holding(scene: Scene, taken: Tensor) -> list[Selection]:
+    """The objects of a scene that have at least `HELD` of some Gaussians ``[N]`` bool."""
+    least = HELD * max(int(taken.sum()), 1)
+    return [each for each in scene.objects if int((taken & each.mask).sum()) >= least]
+
+
+def _of_objects(scene: Scene, part: str, word: Word, taken: Tensor) -> Word:
+    """A part without its thing as that part of each object that has much of what its name selects: "mug handle"."""
+    named = dict.fromkeys(each.phrase for each in holding(scene, taken))
+    found = scene.ask([f"{name} {part}" for name in named], checked=True) if named else ()
+    held = [each for each, here in zip(found.words, found.presences) if here != "no"] if found else []
+    if not held:
+        return word
+    scores, own = (torch.stack(rows).amax(0) for rows in zip(*((each.scores, each.own) for each in held)))
+    return replace(word, scores=scores, own=own, note=f"the {part} of the {' and the '.join(named)}")
+
+
+def object_colors(scene: Scene, thing: Selection) -> list[str]:
+    """The color words of an object, the most frequent first (`lexsplat.queries.colors`)."""
+    return color_words(*_pixels(scene, thing))
+
+
+def seen_colors(scene: Scene, thing: Selection) -> list[str]:
+    """Every color that an object is seen in, also those of a small part of it."""
+    return [color for color, share in color_shares(*_pixels(scene, thing)).items() if share >= SEEN]
+
+
+def _pixels(scene: Scene, thing: Selection) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The colors of an object's Gaussians ``[M, 3]`` in 0..1, and what the views show of each ``[M]``."""
+    colors = colors_of(thing.selected).astype(np.float64) / 255
+    return colors, shown_weights(scene)[thing.indices].double().cpu().numpy()
+
+
+def shown_weights(scene: Scene) -> torch.Tensor:
+    """Visible weight of each Gaussian in the training views ``[N]``; its opacity if that is not known."""
+    segments = scene.field.segments
+    return scene.gaussians.opacities.detach() if segments is None else segments.masses
