@@ -63,6 +63,9 @@ def closed(library: Library) -> Library:
 def test_presence_is_that_of_the_scene_and_counts_and_places_nearly_always(demo_library):
     scene = open_scene("demo")
     colored = ["green apple", "red apple", "yellow banana", "white vase", "mug handle", "toy", "fruit"]
+    colored += [
+        f"{color} {name}" for color in ("blue", "red", "yellow") for name in ("apple", "teddy bear", "mug")
+    ]
     words = list(dict.fromkeys([*default_vocabulary("bundled"), *everyday_words()[::9], *colored]))
     scene.embed(words)
     presences, counts, apart, sizes, scores = [], [], [], [], []

@@ -35,6 +35,7 @@ from lexsplat.runtime.fingerprints import digest
 from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.library.records import damaged, mapped_tensors
 from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.words import seen_colors
 
 _MOST = 2048
 """Segments of the lowest kept level, at most, unless the coarsest level has more."""
@@ -178,6 +179,7 @@ class Contents:
                 "views": pictures["views"],
                 "world": scene.world.to_json(),
                 "objects": [each.geometry() for each in scene.objects],
+                "colors": [seen_colors(scene, each) for each in scene.objects],
             },
         )
 

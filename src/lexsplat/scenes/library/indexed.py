@@ -28,6 +28,7 @@ from lexsplat.geometry.world import World
 from lexsplat.language.segment_codes import SegmentCodes, segment_codes
 from lexsplat.language.segments import Segments
 from lexsplat.queries.clusters import LINK
+from lexsplat.queries.colors import color_told, may_be
 from lexsplat.queries.everyday import EverydayScale
 from lexsplat.queries.grammar import understand
 from lexsplat.queries.kinds import is_kind, is_of_kind, words_of_things
@@ -157,6 +158,11 @@ def answer_from(contents: Contents, codes: Tensor, thing: Thing, phrase: str, te
     (presence,) = classifier.classify([thing.text], unit, torch.zeros(1, 1))
     if presence == "no":
         return Indexed({**_answer([], presence), **common}, contents)
+    if presence == "yes" and (told := color_told(thing.text)):
+        seen = _colors_of(contents, words[-1])
+        if not seen:
+            return None
+        presence = "yes" if any(may_be(told, colors) for colors in seen) else "unsure"
     best = classifier.best_heights([thing.text])
     by_code = classifier.scale.relevancy(classifier.language.codebook.clip, unit, best)[:, 0].numpy()
     own = torch.from_numpy(np.clip(_spread(contents) @ by_code, 0, 1))[None]
@@ -169,6 +175,12 @@ def answer_from(contents: Contents, codes: Tensor, thing: Thing, phrase: str, te
     parts = [taken] if words[-1] in STUFF else _instances(contents, taken, own[0].numpy())
     found = [_instance(contents, part, scores, thing.text) for part in parts]
     return Indexed({**_answer([each[0] for each in found], presence), **common}, contents, *found[0][1:])
+
+
+def _colors_of(contents: Contents, name: str) -> list[set[str]]:
+    """The colors that the objects with a name are seen in, of each; none where the index does not hold them."""
+    named = zip(contents.facts["objects"], contents.facts.get("colors", ()))
+    return [set(colors) for each, colors in named if each["name"].split()[-1] == name]
 
 
 def _answer(instances: list[dict[str, Any]], presence: Presence) -> dict[str, Any]:
