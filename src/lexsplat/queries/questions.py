@@ -68,13 +68,19 @@ _NEGATIVE = re.compile(
     re.IGNORECASE,
 )
 """A negative question; it asks what its positive statement asks."""
+_FIXED = (
+    "(?:handle|knob|spout|rim|wheel|tire|roof|wing|beak|head|face|nose|ear|eye|mouth|tail|belly|paw|leg|arm)"
+)
+"""Parts that do not lie about: a leaf on the table is none of the table."""
+_FLAT = "table|desk|tablecloth|cloth|floor|ground|shelf|bed|grass|sand|carpet|chair|sofa|bench"
 _OF_ITS_THING = re.compile(
-    rf"\b((?:{'|'.join(sorted(PARTS))})(?:e?s)?) of (?:(?:the|an?|my|your|this|that) )?"
+    rf"\b((?:{'|'.join(sorted(PARTS))})(?:e?s)?(?= of )|{_FIXED}s?(?= on (?!(?:\w+ ){{0,3}}(?:{_FLAT})\b)))"
+    r" (?:of|on) (?:(?:the|an?|my|your|this|that) )?"
     r"((?:(?!(?:on|in|at|to|of|near|next|under|behind|beside|between|and|or|but|with|that|which|is|are)\b)[\w-]+ ){0,3}"
     rf"(?:{'|'.join(sorted(NAMES))})s?)\b",
     re.IGNORECASE,
 )
-"""A part of a thing: "the nose of the bear" asks for the bear nose."""
+"""A part of a thing: "the nose of the bear" and "the nose on the bear" ask for the bear nose."""
 _HAS_PART = re.compile(
     rf"^(?:does|do|has|have) (?:(?:the|an?|my|your|this|that) )?((?:[\w-]+ ){{0,2}}(?:{'|'.join(sorted(NAMES))})s?) "
     rf"(?:have |got )(?:(?:got|an?|any|the|some) )*((?:{'|'.join(sorted(PARTS))})(?:e?s)?)$",
@@ -92,6 +98,7 @@ _REWORDED = (
     (_HAS_PARTS, r"how many \2 \1"),
     (re.compile(rf"\b(\d+|{'|'.join(NUMBERS)}) or more (?=\w)", re.IGNORECASE), r"at least \1 "),
     (re.compile(r"^(what|which \w+) can be (?:seen|found|spotted) (?=\w)", re.IGNORECASE), r"\1 is "),
+    (re.compile(r"^how many ((?:\w+ ){1,3})(are|is) not (?=\w)", re.IGNORECASE), r"\1that \2 not "),
     (re.compile(r"^what supports (?=(?:the|a|an|my|this|that) )", re.IGNORECASE), "what is under "),
     (
         re.compile(
