@@ -106,6 +106,11 @@ def test_what_has_a_part_is_not_without_it(select):
     words = {"apple": both, "apple stem": select("other apple", first=20)}
     assert torch.equal(asked("apple without stem", words).mask, select("apple").mask)
     assert asked("apple without a stem", {**words, "apple stem": both}).present == "no"
+    objects = tuple(
+        each.described(parts=(each,)) for each in (select("apple"), select("other apple"), select("board"))
+    )
+    stems = {**words, "stem": select("other apple", first=20)}
+    assert torch.equal(asked("things without a stem", stems, objects).mask, select("apple", "board").mask)
     gone = replace(words["apple stem"], present="no")
     assert asked("apple without stem", {**words, "apple stem": gone}).count == 2
 

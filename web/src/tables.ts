@@ -199,17 +199,21 @@ export class Tables implements Source {
 
   /** A part without its thing, as that part of each object that has much of what its name selects; null if none has it. */
   async #ofObjects(part: string, whole: Float32Array, segments: Segments, share: number) {
-    const holding = this.kinds.holding(this.#seen(whole, this.geometry.rule.threshold, segments), share);
-    const names = [...new Set(holding.map(({ name }) => name))];
-    const found: Answer[] = [];
-    for (const name of names) {
+    const taken = new Set(this.#seen(whole, this.geometry.rule.threshold, segments));
+    const holding = this.kinds.holding([...taken], share);
+    const things = holding.filter(({ name }) => !this.dictionary.grammar.has("surfaces", name));
+    const found = new Map<string, Answer>();
+    for (const name of new Set((things.length ? things : holding).map((entry) => entry.name))) {
+      if (this.dictionary.grammar.has("stuff", name)) continue;
       const answer = await this.#plain(`${name} ${part}`, part, "");
-      if (answer && answer.presence !== "no") found.push(answer);
+      const chosen = answer && answer.presence !== "no" ? this.#seen(answer.scores, answer.threshold, segments) : [];
+      if (2 * chosen.filter((i) => taken.has(i)).length > chosen.length) found.set(name, answer!);
     }
-    if (found.length === 0) return null;
+    if (found.size === 0) return null;
+    const answers = [...found.values()];
     const most = (rows: Float32Array[]): Float32Array => rows[0].map((_, i) => Math.max(...rows.map((row) => row[i])));
-    const scores = most(found.map((answer) => answer.scores));
-    return { scores, own: most(found.map((answer) => answer.own ?? answer.scores)), note: `the ${part} of the ${names.join(" and the ")}` };
+    const scores = most(answers.map((answer) => answer.scores));
+    return { scores, own: most(answers.map((answer) => answer.own ?? answer.scores)), note: `the ${part} of the ${[...found.keys()].join(" and the ")}` };
   }
 
   /** Scores of a part, cut within its thing; null for what is none, or whose thing is not here. */

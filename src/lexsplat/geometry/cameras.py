@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from numbers import Real
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +68,7 @@ class Camera:
             form, remedy = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", "divide by K[2, 2] and leave out skew"
             raise ValueError(f"K must be {form}, got {self.K.tolist()}; {remedy}")
         turn, row = self.viewmat[:3, :3], self.viewmat[3]
-        if not is_rotation(turn, _ROUNDING):
+        if not is_rotation(turn, 5 * _ROUNDING):  # entries that are off by 0.001 are so together
             found, remedy = f"a matrix of determinant {np.linalg.det(turn):.3g}", "remove scale and mirroring"
             raise ValueError(f"viewmat[:3, :3] must be a rotation, got {found}; {remedy}")
         if np.abs(row - _LAST).max() > _ROUNDING:
@@ -121,9 +122,15 @@ class Camera:
 
 def _whole(name: str, value: object) -> int:
     """A size as an ``int``, whichever type of number states it."""
-    if isinstance(value, Real) and value % 1 == 0:
-        return int(float(value))
+    number = _number(value)
+    if isinstance(number, Real) and number % 1 == 0:
+        return int(float(number))
     raise ValueError(f"{name} must be a whole number of pixels, got {value!r:.40}")
+
+
+def _number(value: object) -> object:
+    """The number in an array or tensor without dimensions."""
+    return value.item() if getattr(value, "ndim", None) == 0 and hasattr(value, "item") else value
 
 
 def look_at(position: NDArray, target: NDArray, up: NDArray, width: int, height: int, fov_y: float) -> Camera:
@@ -141,6 +148,7 @@ def look_at(position: NDArray, target: NDArray, up: NDArray, width: int, height:
         ValueError: If the field of view is outside its range, the target is at the position, or the directions are
             parallel; see also `Camera`.
     """
+    fov_y = cast(float, _number(fov_y))
     if not (isinstance(fov_y, Real) and 0 < fov_y < np.pi):
         remedy = "convert degrees with math.radians"
         raise ValueError(f"fov_y: expected radians above 0 and below pi, found {fov_y!r:.40}; {remedy}")

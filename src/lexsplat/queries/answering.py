@@ -248,12 +248,14 @@ def _except(phrase: Except, searched: Searched) -> Selection:
 
 
 def _without_any(things: list[Selection], parts: list[Selection]) -> list[Selection]:
-    """The things that have none of some parts; each part is that of the nearest thing."""
-    having = {
-        int(np.argmin([np.linalg.norm(each.center - part.center) for each in things]))
-        for part in parts
-        if things
-    }
+    """The things that have none of some parts; a part is that of the thing it is in, or else of the nearest one."""
+
+    def owner(part: Selection) -> int:
+        inside = [int(each.mask[part.indices].sum()) for each in things]
+        apart = [float(np.linalg.norm(each.center - part.center)) for each in things]
+        return int(np.argmax(inside) if max(inside) else np.argmin(apart))
+
+    having = {owner(part) for part in parts} if things else set()
     return [each for number, each in enumerate(things) if number not in having]
 
 

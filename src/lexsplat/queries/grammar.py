@@ -262,9 +262,9 @@ class _Parser:
         if (named := parts[0].strip()) and parts[1].strip().lower() in ("one", "two"):  # the largest but one
             return Thing(words)
         first = Anything() if not named or patterns.ALL.match(named) else self.phrase(named, depth)
-        if lacks := lacking(first, words, parts[1]):
-            return lacks
         second = self.phrase(patterns.AND_NOT.sub(" and ", parts[1]), depth)
+        if " without " in f" {words.lower()} " and (lacks := lacking(first, second)):
+            return lacks
         bare = second if isinstance(second, Pick) and second.target == Anything() else None
         if bare and not patterns.NAMES_THINGS.search(parts[1]):
             second = replace(bare, target=first)

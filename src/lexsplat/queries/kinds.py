@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from lexsplat.queries.phrases import Phrase, Understood, things_of
 from lexsplat.queries.spelling import strange
-from lexsplat.queries.vocabulary import QUALITIES, default_vocabulary, words
+from lexsplat.queries.vocabulary import PARTS, QUALITIES, default_vocabulary, words
 
 _MEMBERS = {
     "toy": "teddy bear, rubber duck, stuffed animal, doll, ball",
@@ -28,13 +28,16 @@ _SAME = {
 KINDS = {kind: frozenset(words(members)) for kind, members in _MEMBERS.items()}
 KIND_PHRASES = (*_MEMBERS, *_SAME)
 """Every text that names a kind."""
+_LONG = 5
+"""Letters of a part that a misspelled word may mean, at least: "ear" is too like other words."""
 _SHOWN = 40
 """Letters of an unknown word that a note shows, at most."""
 
 
 def words_of_things(clip: str) -> list[str]:
     """Names of things, their qualities and their kinds: what a misspelled word may mean, for an encoder."""
-    return [*default_vocabulary(clip), *sorted(QUALITIES), *KINDS]
+    parts = (part for part in sorted(PARTS) if len(part) >= _LONG)
+    return [*default_vocabulary(clip), *sorted(QUALITIES), *KINDS, *parts]
 
 
 def is_kind(text: str) -> bool:

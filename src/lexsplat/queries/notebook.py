@@ -33,8 +33,8 @@ def selection_html(selection: Selection) -> str:
     shown = ("phrase", "present", "count", "gaussians", "threshold", "best_view")
     facts = {**{name.replace("_", " "): found[name] for name in shown}, "sizes": ", ".join([*sizes, *more])}
     name = found["best_view"]
-    picture = view_image(selection.gaussians, selection.cameras[name], selection.mask) if name else ""
-    return facts_html({**facts, "note": selection.note}) + picture
+    image = view_image(selection.gaussians, selection.cameras[name], selection.mask) if name else ""
+    return facts_html({**facts, "note": selection.note}) + image
 
 
 def facts_html(facts: Mapping[str, object]) -> str:

@@ -89,13 +89,14 @@ _HAS_PART = re.compile(
 """Whether a thing has a part: "does the mug have a handle" asks for the mug handle."""
 _HAS_PARTS = re.compile(
     rf"^how many ((?:{'|'.join(sorted(PARTS))})(?:e?s)?) (?:does|do) (?:(?:the|an?|my|your|this|that) )?"
-    rf"((?:[\w-]+ ){{0,2}}(?:{'|'.join(sorted(NAMES))})s?) have$",
+    rf"((?:[\w-]+ ){{0,2}}(?:{'|'.join(sorted(NAMES))}))s? have$",
     re.IGNORECASE,
 )
 """How many parts a thing has: "how many wheels does the car have" counts the car wheels."""
 _REWORDED = (
     (_HAS_PART, r"\1 \2"),
     (_HAS_PARTS, r"how many \2 \1"),
+    (re.compile(rf"^(how many {_FIXED}s?) are on (?=\w)", re.IGNORECASE), r"\1 on "),
     (re.compile(rf"\b(\d+|{'|'.join(NUMBERS)}) or more (?=\w)", re.IGNORECASE), r"at least \1 "),
     (re.compile(r"^(what|which \w+) can be (?:seen|found|spotted) (?=\w)", re.IGNORECASE), r"\1 is "),
     (re.compile(r"^how many ((?:\w+ ){1,3})(are|is) not (?=\w)", re.IGNORECASE), r"\1that \2 not "),

@@ -118,7 +118,8 @@ def related(
 ) -> Selection:
     """The instances of ``targets`` that stand in a relation to an instance of ``references``.
 
-    A thing below the support of the reference is not "under" it: the table is under a mug, the floor is not.
+    A thing below the support of the reference is not "under" it: the table is under a mug, the floor is not. Nothing
+    is related to a part of itself: the mug is not left of its handle.
 
     Args:
         relation: One that `holds` knows.
@@ -130,7 +131,7 @@ def related(
         (target, reference)
         for reference in references.instances
         for target in targets.instances
-        if not same(target, reference)
+        if not same(target, reference) and not _has(target, reference)
     ]
     held, frame = [], None
     for target, reference in pairs:
@@ -142,6 +143,11 @@ def related(
         held = _not_below_supports(held, frame)
     kept = {id(target) for target, _ in held}
     return _union(targets, [target for target in targets.instances if id(target) in kept])
+
+
+def _has(target: Selection, reference: Selection) -> bool:
+    """Whether most of the reference is a part of the target."""
+    return 2 * int(target.mask[reference.indices].sum()) > len(reference)
 
 
 def _not_below_supports(

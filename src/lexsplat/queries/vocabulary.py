@@ -28,7 +28,7 @@ _QUALITIES = """
 _STATES = """
     open, closed, empty, full, broken, wet, dry, dirty, clean, old, new, dead, alive, lit, ripe, unripe, rotten,
     fresh, hot, cold, warm, heavy, cute, happy, sad, expensive, cheap, real, fake, edible, fragile, rusty, dusty,
-    asleep, awake, frozen, melted, safe, dangerous, comfortable, useful
+    asleep, awake, frozen, melted, dangerous, comfortable, useful
 """
 _PARTS = """
     handle, lid, cap, spout, neck, rim, knob, stem, stalk, leaf, petal, shade, cord, string, flame, wick, cork,
@@ -89,7 +89,8 @@ def thing_of_part(phrase: str) -> str:
 
 def is_part_alone(phrase: str) -> bool:
     """Whether a phrase is one of `PARTS` without its thing, such as "handle" or "wheels"."""
-    return phrase.lower().removesuffix("s") in PARTS
+    article, _, noun = phrase.lower().rpartition(" ")
+    return article in ("", "a", "an", "the") and noun.removesuffix("s") in PARTS
 
 
 def default_vocabulary(clip: str = "") -> list[str]:

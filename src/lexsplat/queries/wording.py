@@ -3,12 +3,28 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 from lexsplat.queries import patterns
 from lexsplat.queries.colors import COLOR_WORDS
 from lexsplat.queries.kinds import is_kind
 from lexsplat.queries.leftovers import NUMBERS, ORDINALS, left_over
-from lexsplat.queries.phrases import Anything, Colored, Except, Phrase, PickName, Thing
+from lexsplat.queries.phrases import (
+    Anything,
+    AtLeast,
+    Between,
+    Both,
+    Colored,
+    Except,
+    InCorner,
+    InPart,
+    Phrase,
+    Pick,
+    PickName,
+    Related,
+    Thing,
+    Together,
+)
 from lexsplat.queries.spelling import singular
 from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, is_part_alone
 
@@ -98,12 +114,25 @@ def names_things(words: str) -> bool:
     return last not in QUALITIES and (singular(last) in NAMES or is_kind(singular(last)))
 
 
-def lacking(first: Phrase, words: str, rest: str) -> Phrase | None:
-    """ "Mug without handle": mugs that have none; None if ``rest`` is no part of a thing, or is only taken off."""
-    part = singular(undetermined(rest.strip()))
-    if not isinstance(first, Thing) or not is_part_alone(part) or " without " not in f" {words.lower()} ":
+def lacking(first: Phrase, part: Phrase) -> Phrase | None:
+    """What has none of a part: "mug without handle"; None where what is taken off is no part of a thing.
+
+    A place behind the part is that of the thing: "mug without a handle on the table".
+    """
+    if isinstance(part, (Both, Together)):
+        without_one = lacking(first, part.first)
+        return without_one and lacking(without_one, part.second)
+    if isinstance(part, (Related, Between, InCorner, InPart)):
+        target = lacking(first, part.target)
+        return target and replace(part, target=target)
+    if not isinstance(part, Thing) or not is_part_alone(part.text):
         return None
-    return Except(first, Thing(f"{first.text} {part}"), lacks=True)
+    if isinstance(first, (Pick, AtLeast)):
+        target = lacking(first.target, part)
+        return target and replace(first, target=target)
+    if isinstance(first, Thing) and not is_kind(first.text):
+        part = Thing(f"{first.text} {part.text}")
+    return Except(first, part, lacks=True)
 
 
 def all_qualities(words: str) -> bool:

@@ -84,6 +84,10 @@ class Answers:
         made = word.selection = word.selection or self._selection(index)
         return made if made.present == present else made.described(present=present)
 
+    def note(self, index: int) -> str:
+        """How a prompt is answered, if as something else: "the handle of the mug"."""
+        return self.words[index].note if self.words else ""
+
     def chosen(self, index: int) -> Tensor:
         """The Gaussians ``[N]`` bool that reach the threshold of a prompt and can be seen."""
         return (self.scores[index] >= self.thresholds[index]) & ~self.scene.hidden
@@ -167,7 +171,7 @@ def answer_queries(
             "peak_view": names[0],
             "gaussians": len(found.selection(number)),
             "present": present,
-            "note": in_own_words(prompt, scene.clip).note,
+            "note": "; ".join(filter(None, (in_own_words(prompt, scene.clip).note, found.note(number)))),
             "views": {},
         }
         for number, (prompt, limit, present) in enumerate(zip(found.prompts, thresholds, found.presences))

@@ -20,7 +20,7 @@ from lexsplat.queries.parts import FEWEST, HELD, part_scores, with_parts
 from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
 from lexsplat.queries.thresholds import BORDER
-from lexsplat.queries.vocabulary import is_part_alone, thing_of_part
+from lexsplat.queries.vocabulary import STUFF, SURFACES, is_part_alone, thing_of_part
 from lexsplat.scenes.formats.tables import colors_of
 
 if TYPE_CHECKING:
@@ -117,13 +117,19 @@ def holding(scene: Scene, taken: Tensor) -> list[Selection]:
 
 def _of_objects(scene: Scene, part: str, word: Word, taken: Tensor) -> Word:
     """A part without its thing as that part of each object that has much of what its name selects: "mug handle"."""
-    named = dict.fromkeys(each.phrase for each in holding(scene, taken))
-    found = scene.ask([f"{name} {part}" for name in named], checked=True) if named else ()
-    held = [each for each, here in zip(found.words, found.presences) if here != "no"] if found else []
-    if not held:
+    held = holding(scene, taken)
+    things = [each for each in held if each.phrase not in SURFACES]
+    found = {}
+    for name in dict.fromkeys(each.phrase for each in things or held if each.phrase not in STUFF):
+        answers = scene.ask(f"{name} {part}", checked=True)
+        chosen = answers.chosen(0)
+        # Where the two disagree about the place, the word by itself is as likely to be right.
+        if answers.presences[0] != "no" and 2 * int((chosen & taken).sum()) > int(chosen.sum()):
+            found[name] = answers.words[0]
+    if not found:
         return word
-    scores, own = (torch.stack(rows).amax(0) for rows in zip(*((each.scores, each.own) for each in held)))
-    return replace(word, scores=scores, own=own, note=f"the {part} of the {' and the '.join(named)}")
+    scores, own = (torch.stack(rows).amax(0) for rows in zip(*((w.scores, w.own) for w in found.values())))
+    return replace(word, scores=scores, own=own, note=f"the {part} of the {' and the '.join(found)}")
 
 
 def object_colors(scene: Scene, thing: Selection) -> list[str]:

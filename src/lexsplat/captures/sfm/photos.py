@@ -116,10 +116,10 @@ class PhotoPoses:
         if self.all_pairs:
             line = f"{line} after all pairs of the unregistered photos were matched"
         of_reason = [(self.reasons.get(name, ""), name) for name in self.unregistered]
+        told = []
         for reason, group in itertools.groupby(sorted(of_reason), lambda each: each[0]):
-            names = ", ".join(name for _, name in group)
-            line = f"{line}; unregistered: {names}" + (f" ({reason})" if reason else "")
-        return line
+            told.append(", ".join(name for _, name in group) + (f" ({reason})" if reason else ""))
+        return f"{line}; unregistered: {'; '.join(told)}" if told else line
 
 
 def poses_from_photos(

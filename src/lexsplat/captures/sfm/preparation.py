@@ -198,8 +198,8 @@ def _left_out(folder: Path) -> list[str]:
         told = "is left out: its format is" if len(other) == 1 else "are left out: their formats are"
         notes.append(f"{_some(other)} {told} not read; save as JPEG or PNG")
     if videos := videos_in(folder):
-        told = "is left out: a video is" if len(videos) == 1 else "are left out: videos are"
-        notes.append(f"{_some(videos)} {told} given by itself, without photos")
+        told = "is" if len(videos) == 1 else "are"
+        notes.append(f"{_some(videos)} {told} left out: a video is given by itself, without photos")
     return notes
 
 

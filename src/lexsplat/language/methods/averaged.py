@@ -46,11 +46,11 @@ from lexsplat.runtime.sampling import evenly
 
 log = logging.getLogger("lexsplat")
 
-AGREEING = 0.5
-"""Usual agreement of the views, 1 - u_G, below which the features are doubted.
+AGREEING = 0.4
+"""Agreement of the views, 1 - u_G, below which the features are doubted.
 
-Scenes of encoders that know their things have .66 to .86. Features of the wrong views, or mirrored ones, have .3 to
-.4, and noise 0 (docs/lab-notes/2026-11-encoders.md).
+Scenes of encoders that know their things have .66 to .86, and .42 after a hundred steps at a quarter of the size.
+Features of the wrong views, or mirrored ones, have .3 to .4, and noise 0 (docs/lab-notes/2026-11-encoders.md).
 """
 _TOLD_FROM = 12
 """Fewest views with a forecast: the calibration takes as long as about four of them."""
@@ -166,7 +166,7 @@ def _doubt_features(field: CodeField, shown: Tensor) -> None:
     if agreement < AGREEING:
         log.warning(
             "the photos disagree about the language of what they show (agreement %.2f, usually over %.2f): "
-            "answers may be wrong; the encoder may not know such things, or cameras or "
+            "answers may be wrong; the encoder may not know such things, the steps may be too few, or cameras or "
             "features may be those of other photos",
             agreement,
             AGREEING,

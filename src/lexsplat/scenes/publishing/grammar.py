@@ -8,7 +8,7 @@ from typing import Any
 from lexsplat.queries import leftovers, patterns, questions
 from lexsplat.queries.colors import COLOR_WORDS, NEAR
 from lexsplat.queries.kinds import KIND_PHRASES
-from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES
+from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, STUFF, SURFACES
 
 _OF_THE_GRAMMAR = (
     "RELATION", "BETWEEN", "CORNER", "PART", "ASIDE", "NEAR_ME", "MY_SIDE", "DETERMINER", "THE_ONE", "EXCEPT", "NOT",
@@ -44,6 +44,8 @@ def page_grammar() -> dict[str, Any]:
             "patterns": sorted(patterns.PATTERNS),
             "kinds": list(KIND_PHRASES),
             "names": sorted(NAMES),
+            "surfaces": sorted(SURFACES),
+            "stuff": sorted(STUFF),
         },
         "materials": patterns.MATERIAL,
     }
