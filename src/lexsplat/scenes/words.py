@@ -112,7 +112,7 @@ def of_color(scene: Scene, prompt: str, word: Word) -> Word:
 def holding(scene: Scene, taken: Tensor) -> list[Selection]:
     """The objects of a scene that have at least `HELD` of some Gaussians ``[N]`` bool."""
     least = HELD * max(int(taken.sum()), 1)
-    return [each for each in scene.objects if int((taken & each.mask).sum()) >= least]
+    return [each for each in scene.objects if int(taken[each.indices].sum()) >= least]
 
 
 def _of_objects(scene: Scene, part: str, word: Word, taken: Tensor) -> Word:
@@ -138,8 +138,12 @@ def object_colors(scene: Scene, thing: Selection) -> list[str]:
 
 
 def seen_colors(scene: Scene, thing: Selection) -> list[str]:
-    """Every color that an object is seen in, also those of a small part of it."""
-    return [color for color, share in color_shares(*_pixels(scene, thing)).items() if share >= SEEN]
+    """Every color that an object is seen in, also those of a small part of it; kept with the selection."""
+    known: dict[str, list[str]] = thing.__dict__
+    if "_seen_colors" not in known:
+        shares = color_shares(*_pixels(scene, thing))
+        known["_seen_colors"] = [color for color, share in shares.items() if share >= SEEN]
+    return known["_seen_colors"]
 
 
 def _pixels(scene: Scene, thing: Selection) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
