@@ -134,7 +134,8 @@ class Parser {
   /** Whether words behind "that are" name things: "toys", "red cars". */
   #namesThings(words: string): boolean {
     const last = words.toLowerCase().split(" ").at(-1)!;
-    return !this.grammar.has("qualities", last) && singulars(last).some((form) => this.grammar.has("names", form) || this.grammar.has("kinds", form));
+    const known = singulars(last).some((form) => this.grammar.has("names", form) || this.grammar.has("kinds", form));
+    return !this.grammar.has("qualities", last) && (known || /[^sui]s$/.test(last));
   }
 
   #difference(words: string): Thing[] | null {

@@ -93,6 +93,11 @@ _HAS_PARTS = re.compile(
     re.IGNORECASE,
 )
 """How many parts a thing has: "how many wheels does the car have" counts the car wheels."""
+_NO_PART = re.compile(
+    rf"\b(?:(?:that|which|who) (?:has|have)|with) no (?=(?:{'|'.join(sorted(PARTS))})(?:e?s)?\b)",
+    re.IGNORECASE,
+)
+"""That a thing lacks a part: "bottle that has no cork" is a bottle without cork."""
 _REWORDED = (
     (_HAS_PART, r"\1 \2"),
     (_HAS_PARTS, r"how many \2 \1"),
@@ -116,6 +121,7 @@ _REWORDED = (
         r"is \1 \3 \2",
     ),
     (_OF_ITS_THING, r"\2 \1"),
+    (_NO_PART, "without "),
     (_NEGATIVE, r"\1 "),
     (re.compile(r"\b(everything|anything|nothing|all)( else)? besides\b", re.IGNORECASE), r"\1 except"),
     (

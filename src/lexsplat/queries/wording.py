@@ -109,9 +109,10 @@ def is_quality(words: str) -> bool:
 
 
 def names_things(words: str) -> bool:
-    """Whether words behind "that are" name things: "toys", "red cars"."""
+    """Whether words behind "that are" name things: "toys", "red cars", "roses"."""
     last = words.lower().split()[-1]
-    return last not in QUALITIES and (singular(last) in NAMES or is_kind(singular(last)))
+    known = last in NAMES or is_kind(last) or singular(last) in NAMES or is_kind(singular(last))
+    return last not in QUALITIES and (known or re.search("[^sui]s$", last) is not None)
 
 
 def lacking(first: Phrase, part: Phrase) -> Phrase | None:
