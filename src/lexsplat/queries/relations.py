@@ -131,13 +131,13 @@ def related(
         (target, reference)
         for reference in references.instances
         for target in targets.instances
-        if not same(target, reference) and not _has(target, reference)
+        if not same(target, reference)
     ]
     held, frame = [], None
     for target, reference in pairs:
         one, other = _disjoint(target, reference)
         frame = viewer(one, other) if callable(viewer) else viewer
-        if holds(relation, one, other, frame):
+        if holds(relation, one, other, frame) and not _has(target, reference):
             held.append((target, reference))
     if relation == "under" and frame is not None and len(held) > 1:
         held = _not_below_supports(held, frame)

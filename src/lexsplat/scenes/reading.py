@@ -47,7 +47,8 @@ class SceneContent:
         """
         built_with = present_name(self.folder.record.get("config", {}).get("clip", "bundled"))
         name = present_name(given or built_with)
-        if (needed := self.folder.record["stages"].get("features", {}).get("clip_hash")) is None:
+        needed = self.folder.record["stages"].get("features", {}).get("clip_hash")
+        if needed is None or name == built_with == "bundled":
             return name
         if name != built_with:  # known words would be answered without the encoder
             check_encoder(name, content_hash(model_folder(name, "clip"), "clip"), needed)
