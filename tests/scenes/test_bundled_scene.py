@@ -96,6 +96,7 @@ def test_a_part_without_its_thing_is_that_of_the_object_that_has_it(demo, alone,
     thing = whole.removesuffix(f" {alone}")
     assert demo.find(alone).note == f"the {alone} of the {thing}"
     assert torch.equal(demo.find(alone).mask, demo.find(whole).mask)
+    assert torch.equal(demo.ask(f"the {alone}").scores, found.scores)
 
 
 def test_a_part_that_several_objects_have_is_that_of_each(demo):

@@ -69,6 +69,6 @@ def color_told(phrase: str) -> set[str]:
 
 
 def may_be(told: set[str], seen: set[str]) -> bool:
-    """Whether one of the colors that are told is among those that are seen, or near one."""
+    """Whether a thing seen in some colors may have one of the colors that a phrase tells, in another light."""
     pairs = [set(pair.split()) for pair in NEAR]
     return bool(told & seen) or any(pair & told and pair & seen for pair in pairs)

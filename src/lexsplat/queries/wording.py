@@ -25,7 +25,6 @@ from lexsplat.queries.phrases import (
     Thing,
     Together,
 )
-from lexsplat.queries.spelling import singular
 from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, is_part_alone
 
 
@@ -111,8 +110,8 @@ def is_quality(words: str) -> bool:
 def names_things(words: str) -> bool:
     """Whether words behind "that are" name things: "toys", "red cars", "roses"."""
     last = words.lower().split()[-1]
-    known = last in NAMES or is_kind(last) or singular(last) in NAMES or is_kind(singular(last))
-    return last not in QUALITIES and (known or re.search("[^sui]s$", last) is not None)
+    is_plural = re.search("[^sui]s$", last) is not None
+    return last not in QUALITIES and (is_plural or last in NAMES or is_kind(last))
 
 
 def lacking(first: Phrase, part: Phrase) -> Phrase | None:

@@ -6,6 +6,7 @@ A kind such as "toy" is its members (`lexsplat.queries.kinds`), a part is cut wi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -102,11 +103,14 @@ def of_color(scene: Scene, prompt: str, word: Word) -> Word:
         return word
     taken = (word.scores >= BORDER) & ~scene.hidden
     held, name = holding(scene, taken), prompt.lower().split()[-1]
-    named = [each for each in scene.objects if each.phrase.split()[-1] == name]
-    if named and held and not any(each is other for each in held for other in named):
+    if held and name in _last_words(scene.objects) - _last_words(held):
         return replace(word, presence="unsure")
     seen = {color for each in held for color in seen_colors(scene, each)}
     return replace(word, presence="unsure") if seen and not may_be(told, seen) else word
+
+
+def _last_words(things: Sequence[Selection]) -> set[str]:
+    return {each.phrase.split()[-1] for each in things}
 
 
 def holding(scene: Scene, taken: Tensor) -> list[Selection]:
@@ -117,7 +121,7 @@ def holding(scene: Scene, taken: Tensor) -> list[Selection]:
 
 def _of_objects(scene: Scene, part: str, word: Word, taken: Tensor) -> Word:
     """A part without its thing as that part of each object that has much of what its name selects: "mug handle"."""
-    held = holding(scene, taken)
+    held, part = holding(scene, taken), part.split()[-1]  # without its article
     things = [each for each in held if each.phrase not in SURFACES]
     found = {}
     for name in dict.fromkeys(each.phrase for each in things or held if each.phrase not in STUFF):

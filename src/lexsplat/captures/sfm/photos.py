@@ -180,19 +180,22 @@ def poses_from_photos(
         if best is None:
             _discard(work, output)
             raise _none_registered(folder, len(names))
-        unregistered = mapping.unregistered(names, best)
-        reasons = mapping.why_unregistered(database, unregistered)
+        reasons = mapping.why_unregistered(database, mapping.unregistered(names, best))
         mapping.write_model(best.model, output)
     _discard(work, output)
-    registered = tuple(sorted(set(names) - set(unregistered)))
-    listener(Event(STAGE, total, total, {"registered": len(registered), "photos": len(names)}))
-    points, images = best.model.num_points3D(), photos.images
+    found = _found(output, photos, best, reasons)
+    listener(Event(STAGE, total, total, {"registered": len(found.registered), "photos": len(names)}))
+    return found
+
+
+def _found(output: Path, photos: PreparedPhotos, best: Attempt, reasons: Mapping[str, str]) -> PhotoPoses:
+    """The poses of the best attempt, and why each of the other photos has none."""
     return PhotoPoses(
         output,
-        images,
-        registered,
-        unregistered,
-        points,
+        photos.images,
+        tuple(sorted(set(photos.names) - set(reasons))),
+        tuple(reasons),
+        best.model.num_points3D(),
         best.models,
         best.mapper,
         best.all_pairs,
