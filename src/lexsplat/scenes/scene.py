@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -42,6 +42,7 @@ from lexsplat.queries.scoring import form_used, render_gaussian_scores, scores_i
 from lexsplat.queries.seen import Seen
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import check_threshold
+from lexsplat.queries.vocabulary import thing_of_part
 from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.device import choose_device
@@ -233,6 +234,9 @@ class Scene:
         found = {prompt: words_of.get(prompt) for prompt in dict.fromkeys(prompts)}
         new = [prompt for prompt, word in found.items() if word is None]
         if new:
+            # A part is cut within its thing, which is asked for with it.
+            things = (thing for thing in map(thing_of_part, new) if thing and words_of.get(thing) is None)
+            new = list(dict.fromkeys([*things, *new]))
             with self._working:
                 found.update((p, words_of.put(p, word)) for p, word in zip(new, self._new_words(new)))
         words = [word for prompt in prompts if (word := found[prompt]) is not None]
@@ -373,15 +377,15 @@ class Scene:
         """Gaussians ``[N]`` bool that the views hardly show, as far as a scene with segments knows."""
         return torch.zeros_like(self.gaussians.opacity_logits).bool() if not self.seen else self.seen.hidden
 
-    def _new_words(self, prompts: list[str]) -> list[Word]:
-        """Scores and presence of prompts that were not asked before."""
+    def _new_words(self, prompts: list[str]) -> Iterator[Word]:
+        """Scores and presence of prompts that were not asked before, each when the former ones are known."""
         question = self.question(prompts)
         scores = gaussian_relevancy(self.field, question)
         presences = self.presence_classifier.classify(prompts, question.positives, scores)
         formed = scores_in_form(self.field, self.query, scores, presences)
         # Copies: a row would keep the scores of all prompts asked with it.
         words = [Word(row.clone(), own.clone(), here) for row, own, here in zip(formed, scores, presences)]
-        return [with_objects(self, prompt, word) for prompt, word in zip(prompts, words)]
+        return (with_objects(self, prompt, word) for prompt, word in zip(prompts, words))
 
     # -- views
 
