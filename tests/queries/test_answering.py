@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from support.phrases import parse
 
 from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.queries.answering import Searched, answer
-from lexsplat.queries.grammar import parse
 from lexsplat.queries.selection import Selection
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -3,8 +3,9 @@
 import re
 
 import pytest
+from support.phrases import parse
 
-from lexsplat.queries.grammar import parse, understand
+from lexsplat.queries.grammar import understand
 from lexsplat.queries.phrases import (
     Anything,
     AtLeast,

@@ -3,9 +3,10 @@
 import re
 
 import pytest
+from support.phrases import parse
 
 from lexsplat.queries.everyday import everyday_words
-from lexsplat.queries.grammar import parse, understand
+from lexsplat.queries.grammar import understand
 from lexsplat.queries.leftovers import left_over
 from lexsplat.queries.phrases import (
     Anything,
@@ -387,6 +388,8 @@ def test_words_in_quotation_marks_keep_their_form():
     assert parse('"apples"') == Thing("apples")
     assert parse('"apples"').exact
     assert not parse("apples").exact
+    assert parse("“salt and pepper” on the table") == parse('"salt and pepper" on the table')
+    assert parse("„apples“") == parse("«apples»") == parse('"apples"')
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.phrases import parse
 
 from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.queries.answering import Searched, answer
-from lexsplat.queries.grammar import parse
 from lexsplat.queries.phrases import Related, Thing, Viewer
 from lexsplat.queries.relations import distance, frame_of, holds, nearest, related
 from lexsplat.queries.selection import Selection

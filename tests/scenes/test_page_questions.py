@@ -145,7 +145,7 @@ def test_words_that_name_nothing_are_not_compared_with_the_phrases(page):
     assert page.evaluate("lexsplat.app.source.dictionary.complete('where is the pump')[0]") == "pumpkin"
 
 
-@pytest.mark.parametrize("prompt", ['"', 'red "apple', '"red" "apple'])
+@pytest.mark.parametrize("prompt", ['"', 'red "apple', '"red" "apple', "red “apple"])
 def test_a_quotation_mark_without_its_pair_is_not_answered_as_python_refuses_it(page, demo, prompt):
     with pytest.raises(QueryError, match="expected quotation marks in pairs, found an odd number"):
         demo.find(prompt)

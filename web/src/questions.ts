@@ -45,7 +45,8 @@ export function understood(text: string, grammar: Grammar): Question {
 }
 
 /** The prompts of a text: one for each thing between commas, or one where the commas belong to a question. */
-export function prompts(text: string, grammar: Grammar): string[] {
+export function prompts(typed: string, grammar: Grammar): string[] {
+  const text = typed.replace(/[“”„‟«»]/g, '"');
   const parts = text.split(",").map((part) => part.trim()).filter(Boolean);
   const joins = (part: string): boolean =>
     /^(?:and not|not|but|or|that|which|who|please|thanks?|thank you|right|correct|yes|no)\b/i.test(part) ||

@@ -24,7 +24,7 @@ red thing, yellow toys               the objects, or those of a kind, in a color
 what can I drink from?               the same as "something to drink from"
 how many apples are there?           the same as "apple"; plurals are asked for in the singular
 where is the mug? show me the mug    the same as "mug" (`_FRAMES`)
-"something on wheels"                in quotation marks: one thing, whatever its words
+"something on wheels"                in quotation marks, straight or curly: one thing, whatever its words
 
 What does not fit or lacks a part is one thing, asked for in its own words, and `Understood.note` says so.
 """
@@ -80,7 +80,7 @@ from lexsplat.queries.questions import (
     states,
     with_asking_words,
 )
-from lexsplat.queries.spelling import singular
+from lexsplat.queries.spelling import singular, straight_quotes
 from lexsplat.queries.vocabulary import QUALITIES, SURFACES
 from lexsplat.queries.wording import (
     all_qualities,
@@ -108,17 +108,13 @@ class _IncompleteError(Exception):
     """A phrase is incomplete. The message is the word that is not understood, such as an "on" at its end."""
 
 
-def parse(text: str) -> Phrase:
-    """The parsed phrase; see `understand`."""
-    return understand(text).phrase
-
-
 def understand(text: str) -> Understood:
     """A phrase or question, parsed.
 
     Raises:
         QueryError: If it is empty, lacks a quotation mark, or has too many parts.
     """
+    text = straight_quotes(text)
     if len(text) > MAX_LENGTH:
         return Understood(Thing(text.strip()), "too long for grammar: asked for as one thing", unknown=True)
     if text.count('"') % 2:

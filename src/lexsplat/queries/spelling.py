@@ -17,6 +17,14 @@ _ALIKE = 0.74
 """Smallest similarity of a word and its typing error (`difflib`): two letters of four changed places."""
 
 
+def straight_quotes(text: str) -> str:
+    """A text with the quotation marks of phones and of other languages as `"`."""
+    return text.translate(_QUOTES)
+
+
+_QUOTES = str.maketrans(dict.fromkeys("“”„‟«»", '"'))
+
+
 def singular(words: str) -> str:
     """The head of a noun phrase in the singular: the last word, or the last before " of "."""
     head, of, rest = words.partition(" of ")

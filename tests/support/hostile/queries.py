@@ -12,9 +12,9 @@ from support.hostile.registry import Reader, reader
 @reader
 def phrases() -> Reader:
     """Phrases as typed by people and programs: the bytes of the file are the phrase."""
-    from lexsplat.queries.grammar import parse
     from lexsplat.queries.relevancy import check_prompts
     from lexsplat.scenes.answers import file_name
+    from support.phrases import parse
 
     def read(folder: Path) -> Any:
         raw = (folder / "phrase.txt").read_bytes().decode("utf-8", "surrogateescape")
