@@ -32,6 +32,7 @@ import lexsplat
 from lexsplat.geometry.boxes import gravity_up
 from lexsplat.geometry.cameras import OPENGL_TO_OPENCV, Camera
 from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.vocabulary import NAMES as NOUNS
 from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary
 from lexsplat.scenes.objects import objects_of
 
@@ -49,6 +50,8 @@ NEVER = (
     "bed", "shoe", "pizza", "dog",
 )  # fmt: skip
 SURFACE_KINDS = ("table", "cloth", "wall", "floor")
+MODELED = ("handle", "nose", "belly", "ear", "flame", "wheel", "stalk", "beak", "shade", "cork")
+"""Parts that things of tools/demo_scene have, of those that `lexsplat.queries.vocabulary` knows as parts."""
 NAMES_ASKED = 300
 COLORS = ("red", "green", "blue", "yellow", "white", "brown", "pink", "purple", "orange")
 
@@ -129,9 +132,33 @@ def presence(folder: Path, ground_truth: Path) -> dict:
             },
         }
     present, absent = ([row[1] for row in answer[name]["each"].values()] for name in ("present", "absent"))
+    things = json.loads((ground_truth / "things.json").read_text()).values()
+    answer["parts"], answer["parts of other things"] = parts(lexsplat.open_scene(folder), list(things))
     limit = float(np.quantile(present, 0.1))
     answer["false positives at 90 % recall"] = round(float(np.mean(np.array(absent) >= limit)), 3)
     return answer
+
+
+def parts(scene: lexsplat.Scene, things: list[dict]) -> tuple[dict, dict]:
+    """Answers to the parts of `MODELED` that the scene's things have, and to those that they lack."""
+    has: dict[str, set[str]] = {}
+    for thing in things:
+        kind = ALIASES.get(thing["kind"], thing["kind"])
+        has.setdefault(kind, set()).update(part.removesuffix("s") for part in thing["parts"])
+    kinds = [kind for kind in has if kind not in SURFACE_KINDS and kind.split()[-1] in NOUNS]
+    asked = [(f"{kind} {part}", part in has[kind]) for kind in kinds for part in MODELED]
+    found = dict(zip([phrase for phrase, _ in asked], scene.ask([phrase for phrase, _ in asked]).presences))
+    return tuple(
+        {
+            "phrases": sum(there == wanted for _, there in asked),
+            **{
+                word: sum(found[phrase] == word for phrase, there in asked if there == wanted)
+                for word in ("yes", "unsure", "no")
+            },
+            "each": {phrase: found[phrase] for phrase, there in asked if there == wanted},
+        }
+        for wanted in (True, False)
+    )
 
 
 def accuracy(folder: Path, ground_truth: Path, stride: int) -> dict:

@@ -41,6 +41,10 @@ export interface EverydayRule {
   qualities: string[];
   colors: string[];
   parts: string[];
+  /** The factor by which another part may fit a place better, the names of one part, and the note on a part that is doubtful. */
+  rival: number;
+  alike: string[][];
+  doubtful: string;
 }
 
 /** The constants of lexsplat.queries by which surfaces, instances and evidence are found. */

@@ -77,6 +77,15 @@ export function isPartAlone(phrase: string, rule: EverydayRule): boolean {
   return rule.parts.includes(phrase.toLowerCase().replace(/s$/, ""));
 }
 
+/** Whether another part fits a place, a distribution [K], better than the one that a phrase names; `fits` is [W, K]. */
+export function isDoubtful(phrase: string, place: Float32Array, fits: Float32Array, rule: EverydayRule): boolean {
+  const part = phrase.toLowerCase().split(/\s+/).at(-1)!.replace(/s$/, "");
+  const alike = rule.alike.find((group) => group.includes(part)) ?? [part];
+  const at = (name: number): number => Math.max(0, dot(place, fits.subarray(name * place.length, (name + 1) * place.length)));
+  const own = at(rule.parts.indexOf(part));
+  return rule.parts.some((name, n) => !alike.includes(name) && at(n) > rule.rival * own);
+}
+
 export function hasColor(phrase: string, rule: EverydayRule): boolean {
   return phrase.toLowerCase().split(/\s+/).some((word) => rule.colors.includes(word));
 }

@@ -7,7 +7,7 @@ import type { EverydayRule, PartRule } from "./manifest";
 import { partScores, withParts } from "./parts";
 import { type Language, shownSplats } from "./language";
 import { type Question, type Thing, understood } from "./questions";
-import { type Presence, hasColor, isPart, isPartAlone, peakOf, presenceOf, strengthsOf, thingOfPart } from "./rules";
+import { type Presence, hasColor, isDoubtful, isPart, isPartAlone, peakOf, presenceOf, strengthsOf, thingOfPart } from "./rules";
 import type { Kinds } from "./kinds";
 import type { Segments } from "./segments";
 import type { Spelling } from "./spelling";
@@ -145,7 +145,10 @@ export class Tables implements Source {
     const own = this.language.scores(described.table);
     const thing = thingOfPart(phrase, described.rule);
     const presence = this.#presence(phrase, own, described, thing ? tower.describe(thing) : null);
-    return answered(prompt, color, { phrase, from: "text tower", ...(await this.#whole(phrase, own, presence)) });
+    const found = await this.#whole(phrase, own, presence);
+    const certain = !thing || found.presence !== "yes" || !described.fits || !this.segments;
+    const doubt = certain ? {} : this.#doubt(phrase, this.#seen(found.scores, found.threshold, this.segments!), described);
+    return answered(prompt, color, { phrase, from: "text tower", ...found, ...doubt });
   }
 
   /** As `lexsplat.queries.presence` has it: parts at segments, all else at objects. */
@@ -181,7 +184,8 @@ export class Tables implements Source {
     const parts = isPartAlone(phrase, words) ? await this.#ofObjects(phrase, whole, this.segments, held) : null;
     const scores = parts?.scores ?? (await this.#cut(phrase, own, whole, this.segments, this.cuts)) ?? whole;
     const seen = this.#hasColor(phrase, this.#seen(scores, threshold, this.segments), held);
-    return { scores, own, ...parts, presence: presence === "yes" && !seen ? ("unsure" as const) : presence, threshold };
+    const sure = seen && parts?.presence !== "unsure";
+    return { scores, own, ...parts, presence: presence === "yes" && !sure ? ("unsure" as const) : presence, threshold };
   }
 
   /** Whether what is selected may have the color and the name that a phrase tells of it; true if no color is told or known. */
@@ -210,10 +214,18 @@ export class Tables implements Source {
       if (2 * chosen.filter((i) => taken.has(i)).length > chosen.length) found.set(name, answer!);
     }
     if (found.size === 0) return null;
-    const answers = [...found.values()];
+    const certain = [...found].filter(([, { presence }]) => presence === "yes");
+    const kept = certain.length ? certain : [...found];
+    const answers = kept.map(([, answer]) => answer);
     const most = (rows: Float32Array[]): Float32Array => rows[0].map((_, i) => Math.max(...rows.map((row) => row[i])));
     const scores = most(answers.map((answer) => answer.scores));
-    return { scores, own: most(answers.map((answer) => answer.own ?? answer.scores)), note: `the ${part} of the ${[...found.keys()].join(" and the ")}` };
+    return { scores, own: most(answers.map((answer) => answer.own ?? answer.scores)), note: `the ${part} of the ${kept.map(([name]) => name).join(" and the ")}`, ...(certain.length ? {} : { presence: "unsure" as const }) };
+  }
+
+  /** "Unsure" and a note for a part that another name of a part fits better. */
+  #doubt(phrase: string, splats: number[], { fits, rule }: Description): Partial<Answer> {
+    const place = this.language.distribution(splats, splats.map((i) => this.segments!.masses[i]));
+    return splats.length && isDoubtful(phrase, place, fits!, rule) ? { presence: "unsure", note: rule.doubtful } : {};
   }
 
   /** Scores of a part, cut within its thing; null for what is none, or whose thing is not here. */

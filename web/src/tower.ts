@@ -16,6 +16,8 @@ export interface Description {
   /** Distributions of the scene's objects, and the best heights for phrases with a color; null without segments. */
   places: Float32Array | null;
   colored: Float32Array | null;
+  /** How well the names of parts fit the codes [W, K]; null without segments. */
+  fits: Float32Array | null;
 }
 
 interface Matrix {
@@ -93,11 +95,12 @@ export class TextTower {
     const { everyday } = this.#text;
     const heights = this.#heights(phrase);
     const best = this.#get("best").data as Float32Array;
-    const [places, colored] = ["places", "best_colored"].map((name) => (this.#tensors.get(name)?.data as Float32Array) ?? null);
+    const tables = ["places", "best_colored", "part_fits"];
+    const [places, colored, fits] = tables.map((name) => (this.#tensors.get(name)?.data as Float32Array) ?? null);
     const compared = colored && hasColor(phrase, everyday) && !isPart(phrase, everyday) ? colored : best;
     const thing = thingOfPart(phrase, everyday);
     const rivals = thing ? besideThing(heights, this.#heights(thing), compared, everyday) : compared;
-    return { table: relevancyOf(heights, rivals, everyday), heights, best, compared, rule: everyday, places, colored };
+    return { table: relevancyOf(heights, rivals, everyday), heights, best, compared, rule: everyday, places, colored, fits };
   }
 
   #heights(phrase: string): Heights {

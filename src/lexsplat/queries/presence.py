@@ -31,8 +31,10 @@ from torch import Tensor
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.segment_codes import SegmentCodes, codes_of_field
+from lexsplat.queries import part_names
 from lexsplat.queries.everyday import BORDER, EverydayScale, everyday_words, peaks
 from lexsplat.queries.objects import whole_segments
+from lexsplat.queries.part_names import fits_of
 from lexsplat.queries.selection import Presence
 from lexsplat.queries.vocabulary import COLORS, has_color, is_part, thing_of_part
 
@@ -179,8 +181,9 @@ class PresenceClassifier:
 
     @property
     def tables(self) -> dict[str, Tensor]:
-        """Tables for pages: distributions ``[V, K]`` of objects, and the best heights for colors ``[K]``."""
-        return {"places": self.places.distributions, "best_colored": self._best_colored}
+        """Tables for pages: objects as distributions ``[V, K]``, best heights for colors ``[K]``, fits of parts."""
+        places, fits = self.places.distributions, self.part_fits.T
+        return {"places": places, "best_colored": self._best_colored, "part_fits": fits}
 
     def strengths(self, texts: Tensor, places: Tensor) -> NDArray[np.float64]:
         """`Evidence.strength` of phrases ``[P, D]`` at places with distributions ``[V, K]``: ``[V, P]``."""
@@ -212,6 +215,11 @@ class PresenceClassifier:
     def colored(self) -> list[str]:
         """The scene's objects in any color, as phrases."""
         return [f"{color} {name}" for color in sorted(COLORS) for name in self.places.words]
+
+    @cached_property
+    def part_fits(self) -> Tensor:
+        """How well the names of parts fit the codes ``[K, W]`` (`lexsplat.queries.part_names`)."""
+        return fits_of(self.scale.heights(self.language.codebook.clip, self._embed(part_names.NAMES)))
 
     @cached_property
     def _best_colored(self) -> Tensor:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from lexsplat.queries.colors import SEEN, color_shares, color_told, color_words, may_be
 from lexsplat.queries.kinds import is_kind, is_of_kind
+from lexsplat.queries.part_names import DOUBTFUL, is_doubtful
 from lexsplat.queries.parts import FEWEST, HELD, part_scores, with_parts
 from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
@@ -89,7 +90,19 @@ def of_part(scene: Scene, prompt: str, word: Word) -> Word:
         return word
     thing = with_parts(thing, taken, scene.gaussians, segments.labels)
     scores = part_scores(word.own, thing, scene.gaussians, segments.masses)
-    return word if scores is None else replace(word, scores=scores)
+    word = word if scores is None else replace(word, scores=scores)
+    return replace(word, presence="unsure", note=DOUBTFUL) if _is_doubtful(scene, prompt, word) else word
+
+
+def _is_doubtful(scene: Scene, prompt: str, word: Word) -> bool:
+    """Whether another name of a part describes what is taken better (`lexsplat.queries.part_names`)."""
+    segments, taken = scene.field.segments, ((word.scores >= BORDER) & ~scene.hidden).nonzero()[:, 0]
+    if word.presence != "yes" or segments is None or not len(taken):
+        return False
+    probabilities, shown = scene.field.select(taken).code_probabilities(), segments.masses[taken]
+    place = shown.to(probabilities) @ probabilities / shown.sum().clamp_min(1e-12)
+    part = prompt.lower().split()[-1].removesuffix("s")
+    return is_doubtful(part, place, scene.presence_classifier.part_fits)
 
 
 def of_color(scene: Scene, prompt: str, word: Word) -> Word:
@@ -130,10 +143,13 @@ def _of_objects(scene: Scene, part: str, word: Word, taken: Tensor) -> Word:
         # Where the two disagree about the place, the word by itself is as likely to be right.
         if answers.presences[0] != "no" and 2 * int((chosen & taken).sum()) > int(chosen.sum()):
             found[name] = answers.words[0]
+    certain = {name: each for name, each in found.items() if each.presence == "yes"}
+    found, presence = (certain, word.presence) if certain else (found, "unsure")
     if not found:
         return word
     scores, own = (torch.stack(rows).amax(0) for rows in zip(*((w.scores, w.own) for w in found.values())))
-    return replace(word, scores=scores, own=own, note=f"the {part} of the {' and the '.join(found)}")
+    note = f"the {part} of the {' and the '.join(found)}"
+    return replace(word, scores=scores, own=own, presence=presence, note=note)
 
 
 def object_colors(scene: Scene, thing: Selection) -> list[str]:

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from lexsplat.features.clip import ClipEncoder
 from lexsplat.features.encoders import load_clip
-from lexsplat.queries import everyday, presence
-from lexsplat.queries.vocabulary import COLORS, NAMES, PARTS, QUALITIES
+from lexsplat.queries import everyday, part_names, presence
+from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES
 from lexsplat.runtime.files import save_tensors
 from lexsplat.scenes.publishing.sidecar import constants_of
 from lexsplat.scenes.scene import Scene
@@ -63,7 +63,10 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
             "names": sorted(NAMES),
             "qualities": sorted(QUALITIES),
             "colors": sorted(COLORS),
-            "parts": sorted(PARTS),
+            "parts": list(part_names.NAMES),
+            "rival": part_names.RIVAL,
+            "alike": part_names.ALIKE,
+            "doubtful": part_names.DOUBTFUL,
         },
     }
 

@@ -15,6 +15,7 @@ from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.grammar import understand
 from lexsplat.queries.phrases import Thing
 from lexsplat.queries.relevancy import embed_prompts
+from lexsplat.queries.vocabulary import thing_of_part
 from lexsplat.runtime.errors import LexsplatError, QueryError
 from lexsplat.runtime.files import read_json
 from lexsplat.runtime.progress import NOTE
@@ -140,6 +141,9 @@ def phrase_answers(scene: Scene, phrases: list[str]) -> tuple[Tensor, list[str]]
         # Evidence lies in the segments, where there are any; scores of a million Gaussians would take a minute.
         scores = field.scores(relevancy).T.contiguous() if field.segments is None else texts.new_zeros(0, 0)
         presences += [presence[0] for presence in scene.presence_classifier.classify(batch, texts, scores)]
+    for number, phrase in enumerate(phrases):
+        if presences[number] == "y" and thing_of_part(phrase):  # it may be another part
+            presences[number] = scene.ask(phrase, checked=True).presences[0][0]
     return torch.cat(tables), presences
 
 
