@@ -100,15 +100,43 @@ def test_a_part_without_its_thing_is_that_of_the_object_that_has_it(demo, alone,
 
 
 def test_a_part_that_several_objects_have_is_that_of_each(demo):
+    apple, pumpkin = (
+        next(each for each in demo.objects if each.phrase == name) for name in ("apple", "pumpkin")
+    )
+    scores = 0.4 + 0.5 * (apple.mask | pumpkin.mask).float()
+    found = of_part(demo, "stalk", Word(scores, scores, "unsure"))
+    assert torch.equal(found.scores, demo.ask(["apple stalk", "pumpkin stalk"]).scores.amax(0))
+    assert found.note == "the stalk of the apple and the pumpkin"
+    absent = Word(scores, scores, "no")
+    assert of_part(demo, "stalk", absent) is absent
+
+
+def test_objects_that_certainly_have_a_part_are_preferred_to_those_that_may_have_it(demo):
     mug, car = (next(each for each in demo.objects if each.phrase == name) for name in ("mug", "toy car"))
     scores = 0.4 + 0.5 * (mug.mask | car.mask).float()
-    found = of_part(demo, "handle", Word(scores, scores, "unsure"))
     handles = demo.ask(["mug handle", "toy car handle"])
-    held = [row for row, here in zip(handles.scores, handles.presences) if here != "no"]
-    assert held
-    assert torch.equal(found.scores, torch.stack(held).amax(0))
-    absent = Word(scores, scores, "no")
-    assert of_part(demo, "handle", absent) is absent
+    assert handles.presences[0] == "yes"
+    assert handles.presences[1] != "yes"
+    found = of_part(demo, "handle", Word(scores, scores, "yes"))
+    assert found.presence == "yes"
+    assert torch.equal(found.scores, handles.scores[0])
+    unlikely = of_part(demo, "wheel", Word(*[0.4 + 0.5 * mug.mask.float()] * 2, "yes"))
+    assert unlikely.presence == "unsure"
+    assert unlikely.note == "the wheel of the mug"
+
+
+@pytest.mark.parametrize(
+    ("part", "present"),
+    [
+        *((part, "yes") for part in ("mug handle", "bear nose", "duck beak", "lamp shade", "bear ears")),
+        *((part, "yes") for part in ("car wheels", "bottle cork", "pumpkin stem", "pumpkin stalk")),
+        *((part, "unsure") for part in ("bear eye", "duck nose", "mug wheel", "car roof", "bottle neck")),
+    ],
+)
+def test_a_part_that_is_another_one_by_its_name_is_not_certain(demo, part, present):
+    answer = demo.ask(part)
+    assert answer.presences == (present,)
+    assert answer.note(0) == ("" if present == "yes" else "names of other parts fit this place better")
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,10 @@ PROMPTS = (
     "wheels",
     "pumpkin stalk",
     "giraffe nose",
+    "old mug wheel",  # another part by its name
+    "mug wheel",
+    "bear eye",
+    "wheel of the duck",
     "blue tea mug",  # compared with other things with a color
     "zebra",  # not in the scene
     "qwzx blorp",
