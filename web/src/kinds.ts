@@ -37,11 +37,24 @@ export class Kinds {
     const all = (this.#members.get(kind) ?? []).filter((place) => this.#places![place]?.splats.length);
     const inColor = (most: number): number[] => all.filter((place) => this.#objects[place].colors?.slice(0, most).includes(color));
     const main = color ? inColor(1) : all;
-    const members = main.length ? main : inColor(Infinity);
+    return this.#answer(main.length ? main : inColor(Infinity), plain);
+  }
+
+  /** The objects of a name that are mostly in one of some colors; null if there are none. */
+  inColors(noun: string, colors: string[], plain: Float32Array): ReturnType<Kinds["find"]> {
+    this.#places ??= this.#found();
+    const isOne = ({ name, colors: own }: ObjectEntry): boolean => name.split(" ").at(-1) === noun && colors.includes(own?.[0] ?? "");
+    const all = [...this.#objects.keys()].filter((place) => isOne(this.#objects[place]) && this.#places![place].splats.length);
+    const found = this.#answer(all, plain);
+    return found && { ...found, note: "" };
+  }
+
+  #answer(members: number[], plain: Float32Array | null): ReturnType<Kinds["find"]> {
     if (members.length === 0) return null;
-    const scores = plain?.slice() ?? new Float32Array(this.geometry.count);
+    const { threshold } = this.geometry.rule;
+    const scores = plain?.map((score) => Math.min(score, threshold - 1e-4)) ?? new Float32Array(this.geometry.count);
     const places = members.map((place) => this.#places![place]);
-    for (const { splats } of places) for (const splat of splats) scores[splat] = 1;
+    for (const { splats } of places) for (const splat of splats) scores[splat] = plain ? Math.max(plain[splat], threshold) : 1;
     const names = [...new Set(members.map((place) => this.#objects[place].name))];
     return { scores, presence: "yes", members: places, places, note: names.join(", ") };
   }

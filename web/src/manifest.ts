@@ -45,6 +45,8 @@ export interface EverydayRule {
   rival: number;
   alike: string[][];
   doubtful: string;
+  /** Nouns of things that edits have taken away. */
+  gone: string[];
 }
 
 /** The constants of lexsplat.queries by which surfaces, instances and evidence are found. */

@@ -129,8 +129,15 @@ export class Tables implements Source {
     return members ? { ...plain!, phrase: kind!, ...members } : plain;
   }
 
-  /** The answer to a phrase by its own relevancy. */
+  /** The answer to a phrase by its own relevancy, or by the pixels of things of its name if it tells a color that language does not find. */
   async #plain(text: string, prompt: string, color: string): Promise<Answer | null> {
+    const plain = await this.#byLanguage(text, prompt, color);
+    const told = plain && plain.presence !== "yes" && this.segments ? this.#colorsTold(plain.phrase) : [];
+    const inColor = told.length ? this.kinds.inColors(plain!.phrase.toLowerCase().split(" ").at(-1)!, told, plain!.scores) : null;
+    return inColor ? { ...plain!, ...inColor } : plain;
+  }
+
+  async #byLanguage(text: string, prompt: string, color: string): Promise<Answer | null> {
     const known = this.dictionary.find(text);
     if (known >= 0) {
       const own = this.language.scores(this.dictionary.table(known));
@@ -144,7 +151,9 @@ export class Tables implements Source {
     const described = tower.describe(phrase);
     const own = this.language.scores(described.table);
     const thing = thingOfPart(phrase, described.rule);
-    const presence = this.#presence(phrase, own, described, thing ? tower.describe(thing) : null);
+    const noun = (thing || phrase).toLowerCase().split(/\s+/).at(-1)!;
+    const isGone = described.rule.gone.includes(this.spelling?.singular(noun) ?? noun);
+    const presence = isGone ? "no" : this.#presence(phrase, own, described, thing ? tower.describe(thing) : null);
     const found = await this.#whole(phrase, own, presence);
     const certain = !thing || found.presence !== "yes" || !described.fits || !this.segments;
     const doubt = certain ? {} : this.#doubt(phrase, this.#seen(found.scores, found.threshold, this.segments!), described);
@@ -191,7 +200,7 @@ export class Tables implements Source {
   /** Whether what is selected may have the color and the name that a phrase tells of it; true if no color is told or known. */
   #hasColor(phrase: string, splats: number[], share: number): boolean {
     const { grammar } = this.dictionary;
-    const told = phrase.toLowerCase().replace("grey", "gray").split(" ").slice(0, -1).filter((word) => grammar.has("told_colors", word));
+    const told = this.#colorsTold(phrase);
     const holding = this.kinds.holding(splats, share);
     const seen = holding.flatMap((entry) => entry.seen_colors ?? []);
     if (told.length === 0 || seen.length === 0) return true;
@@ -199,6 +208,12 @@ export class Tables implements Source {
     if (this.kinds.names.some(isNamed) && !holding.some(({ name }) => isNamed(name))) return false;
     const pairs = [...told.map((color) => [color, color]), ...grammar.list("near_colors").map((pair) => pair.split(" "))];
     return pairs.some(([a, b]) => (told.includes(a) && seen.includes(b)) || (told.includes(b) && seen.includes(a)));
+  }
+
+  /** The colors that a phrase tells of a thing. */
+  #colorsTold(phrase: string): string[] {
+    const before = phrase.toLowerCase().replace("grey", "gray").split(" ").slice(0, -1);
+    return before.filter((word) => this.dictionary.grammar.has("told_colors", word));
   }
 
   /** A part without its thing, as that part of each object that has much of what its name selects; null if none has it. */

@@ -104,9 +104,10 @@ class Answers:
         if phrase.lower().split()[-1] in STUFF:
             seen = replace(selection, mask=self.chosen(index))
             return replace(seen, parts=(seen,)) if seen else seen
-        if present == "yes" and (members := members_of_kind(self.scene, phrase)):
-            known = (each.within(selection.mask) for each in members)
-            return replace(selection, parts=tuple(each.described(scores=scores) for each in known if each))
+        known = self.words[index].members if self.words else members_of_kind(self.scene, phrase)
+        if present == "yes" and known:
+            members = (each.within(selection.mask) for each in known)
+            return replace(selection, parts=tuple(each.described(scores=scores) for each in members if each))
         selection = selection.without_specks()
         if self.automatic:
             selection = selection.convincing(self.words[index].own if self.words else None)

@@ -31,6 +31,7 @@ from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.scenes.filling import Fill, fill_for
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
+from lexsplat.scenes.gone import gone_nouns
 from lexsplat.scenes.journal import Journal, Kind, Step, packed, unpacked
 from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.scene import Scene
@@ -287,6 +288,7 @@ class Editor:
         record["edits_fingerprint"] = fingerprint(
             record.get("edits_fingerprint"), [step.to_json() for step in self.steps]
         )
+        record["gone"] = sorted(gone_nouns(self.scene))
         record["stages"].get("reconstruct", {})["gaussians"] = len(self.scene.gaussians)
         stages, record["stages"] = record["stages"], {}
         folder.record = record

@@ -12,6 +12,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from lexsplat.queries.objects import name_probabilities, whole_segments
+from lexsplat.queries.presence import FAINT
 from lexsplat.queries.relations import same
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import Selection
@@ -113,7 +114,9 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
         both = scene.selection(mask, scores, phrase=name)
         for each in [both] if name in STUFF else both.instances:
             each = each.within(shown)
-            if each:  # nothing is left of what no view shows
+            if (
+                each and float(scene.gaussians.opacities[each.indices].mean()) >= FAINT
+            ):  # not what no view shows
                 found.append(
                     _named(each, words, classifier.strengths(texts, _mean_codes(scene, each)[None])[0])
                 )

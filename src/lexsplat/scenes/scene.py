@@ -99,6 +99,7 @@ class Scene:
         self.query = query or QueryConfig()
         self.given_encode_text = encode_text
         self.text_tower: TextTower | None = None
+        self.original: Scene | None = None  # the scene as it was built, where this one is an edit of it
         self._cache: TextCache | None = None
         if folder is not None:
             own, common = (root / "checkpoints" / "texts" for root in (folder.root, BUNDLED_SCENE))
@@ -133,7 +134,7 @@ class Scene:
         same = self.views, self.clip, self.query, self.folder, self.given_encode_text
         other = Scene(gaussians, field, *same)
         other.text_tower, other._cache, other._texts = self.text_tower, self._cache, self._texts
-        other.listener = self.listener
+        other.listener, other.original = self.listener, self.original or self
         return other
 
     # -- text
@@ -220,8 +221,7 @@ class Scene:
 
         Args:
             prompts: Free-text prompts.
-            threshold: Smallest score of a selected Gaussian, in 0..1; None derives one for each prompt from the
-                training views (`lexsplat.queries.thresholds.scene_thresholds`).
+            threshold: Smallest score of a selected Gaussian, in 0..1; None derives one (`automatic_thresholds`).
             checked: Whether the prompts are names of things, whose words are not checked (again).
 
         Raises:

@@ -24,6 +24,7 @@ from lexsplat.queries.selection import Presence, Selection
 from lexsplat.queries.thresholds import BORDER
 from lexsplat.queries.vocabulary import STUFF, SURFACES, is_part_alone, thing_of_part
 from lexsplat.scenes.formats.tables import colors_of
+from lexsplat.scenes.gone import gone_nouns, noun_of
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -40,6 +41,7 @@ class Word:
         threshold: The automatic threshold; None until it is asked for.
         selection: The selection of that threshold; None until it is asked for.
         note: A remark on how it is answered; "" if there is none.
+        members: The objects that are the answer, where objects are; each is an instance.
     """
 
     scores: Tensor
@@ -48,22 +50,19 @@ class Word:
     threshold: float | None = None
     selection: Selection | None = None
     note: str = ""
+    members: tuple[Selection, ...] = ()
 
 
 def with_objects(scene: Scene, prompt: str, word: Word) -> Word:
     """The answer to a prompt, given its relevancy and its presence by language."""
+    if word.presence != "no" and (noun := noun_of(prompt)) in gone_nouns(scene):
+        return replace(word, scores=word.own, presence="no", note=f"an edit took the {noun} away")
     return of_color(scene, prompt, of_part(scene, prompt, of_kind(scene, prompt, word)))
 
 
 def of_kind(scene: Scene, prompt: str, word: Word) -> Word:
     """The word as it is, or with the objects of its kind ("toy") if the scene has any (`lexsplat.queries.kinds`)."""
-    members = members_of_kind(scene, prompt)
-    if not members:
-        return word
-    taken = torch.stack([each.mask for each in members]).any(0)
-    # Members reach the border, and all others stay below it.
-    inside, outside = word.scores.clamp(min=BORDER), word.scores.clamp(max=BORDER - 1e-4)
-    return replace(word, scores=torch.where(taken, inside, outside), presence="yes")
+    return _of_members(word, members_of_kind(scene, prompt))
 
 
 def members_of_kind(scene: Scene, prompt: str) -> list[Selection]:
@@ -106,20 +105,40 @@ def _is_doubtful(scene: Scene, prompt: str, word: Word) -> bool:
 
 
 def of_color(scene: Scene, prompt: str, word: Word) -> Word:
-    """The word as it is, or "unsure" where what it selects has another color than the prompt tells, or another name.
+    """The word as the pixels have it, if its prompt tells a color of a thing.
 
-    Encoders take a thing for the same thing in another color, whose pixels tell the difference, or another thing of
-    that color for it: a banana for a yellow apple, in a scene with a red one.
+    Encoders take a thing for the same thing in another color, or another thing of that color for it: a banana for a
+    yellow apple, in a scene with a red one. Such a word is "unsure". They also keep the color that a thing had before
+    it was recolored. An object of that name whose pixels have mostly the color is the answer, whatever they say.
     """
     told = color_told(prompt)
-    if not told or word.presence != "yes" or form_used(scene.field, scene.query) != "segment":
+    if not told or form_used(scene.field, scene.query) != "segment" or not scene.field.segments:
         return word
+    if word.presence != "yes":
+        return _of_members(word, of_color_told(scene, prompt, told))
     taken = (word.scores >= BORDER) & ~scene.hidden
     held, name = holding(scene, taken), prompt.lower().split()[-1]
     if held and name in _last_words(scene.objects) - _last_words(held):
         return replace(word, presence="unsure")
     seen = {color for each in held for color in seen_colors(scene, each)}
     return replace(word, presence="unsure") if seen and not may_be(told, seen) else word
+
+
+def of_color_told(scene: Scene, prompt: str, told: set[str]) -> list[Selection]:
+    """The objects of the name in a prompt whose pixels have mostly the color that it tells."""
+    name = prompt.lower().split()[-1]
+    named = [each for each in scene.objects if each.phrase.split()[-1] == name]
+    return [each for each in named if object_colors(scene, each)[0] in told]
+
+
+def _of_members(word: Word, members: Sequence[Selection]) -> Word:
+    """A word that is answered by objects; as it is if there are none."""
+    if not members:
+        return word
+    taken = torch.stack([each.mask for each in members]).any(0)
+    # Members reach the border, and all others stay below it.
+    inside, outside = word.scores.clamp(min=BORDER), word.scores.clamp(max=BORDER - 1e-4)
+    return replace(word, scores=torch.where(taken, inside, outside), presence="yes", members=tuple(members))
 
 
 def _last_words(things: Sequence[Selection]) -> set[str]:

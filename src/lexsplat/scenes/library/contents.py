@@ -33,6 +33,7 @@ from lexsplat.rendering import render
 from lexsplat.runtime.device import one_thread
 from lexsplat.runtime.fingerprints import digest
 from lexsplat.runtime.sampling import evenly
+from lexsplat.scenes.gone import gone_nouns
 from lexsplat.scenes.library.records import damaged, mapped_tensors
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.words import seen_colors
@@ -179,6 +180,7 @@ class Contents:
                 "views": pictures["views"],
                 "world": scene.world.to_json(),
                 "objects": [each.geometry() for each in scene.objects],
+                "gone": sorted(gone_nouns(scene)),
                 "colors": [seen_colors(scene, each) for each in scene.objects],
             },
         )

@@ -39,6 +39,7 @@ from lexsplat.queries.selection import PEAK_COUNT, SMALLEST_SHARE, Presence, Sel
 from lexsplat.queries.spelling import corrected, strange
 from lexsplat.queries.vocabulary import NAMES, STUFF, is_part_alone, thing_of_part
 from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.scenes.gone import noun_of
 from lexsplat.scenes.library.contents import Contents
 
 _LARGE = 0.05
@@ -156,9 +157,13 @@ def answer_from(contents: Contents, codes: Tensor, thing: Thing, phrase: str, te
             return _of_objects(contents, known, common)
     classifier, unit, words = _KeptPresence(contents, codes), text[None].float(), thing.text.lower().split()
     (presence,) = classifier.classify([thing.text], unit, torch.zeros(1, 1))
+    presence = "no" if noun_of(thing.text) in contents.facts.get("gone", ()) else presence
+    told = color_told(thing.text)
+    if presence != "yes" and told and any(told & colors for colors in _colors_of(contents, words[-1])):
+        return None  # an object of this name that is mostly in this color is the answer
     if presence == "no":
         return Indexed({**_answer([], presence), **common}, contents)
-    if presence == "yes" and (told := color_told(thing.text)):
+    if presence == "yes" and told:
         seen = _colors_of(contents, words[-1])
         if not seen:
             return None

@@ -14,6 +14,7 @@ from lexsplat.features.encoders import load_clip
 from lexsplat.queries import everyday, part_names, presence
 from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES
 from lexsplat.runtime.files import save_tensors
+from lexsplat.scenes.gone import gone_nouns
 from lexsplat.scenes.publishing.sidecar import constants_of
 from lexsplat.scenes.scene import Scene
 
@@ -67,6 +68,7 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
             "rival": part_names.RIVAL,
             "alike": part_names.ALIKE,
             "doubtful": part_names.DOUBTFUL,
+            "gone": sorted(gone_nouns(scene)),
         },
     }
 

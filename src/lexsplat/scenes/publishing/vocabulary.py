@@ -19,6 +19,7 @@ from lexsplat.queries.vocabulary import thing_of_part
 from lexsplat.runtime.errors import LexsplatError, QueryError
 from lexsplat.runtime.files import read_json
 from lexsplat.runtime.progress import NOTE
+from lexsplat.scenes.gone import gone_nouns, noun_of
 from lexsplat.scenes.scene import Scene
 
 log = logging.getLogger("lexsplat")
@@ -141,7 +142,10 @@ def phrase_answers(scene: Scene, phrases: list[str]) -> tuple[Tensor, list[str]]
         # Evidence lies in the segments, where there are any; scores of a million Gaussians would take a minute.
         scores = field.scores(relevancy).T.contiguous() if field.segments is None else texts.new_zeros(0, 0)
         presences += [presence[0] for presence in scene.presence_classifier.classify(batch, texts, scores)]
+    gone = gone_nouns(scene)
     for number, phrase in enumerate(phrases):
+        if noun_of(phrase) in gone:
+            presences[number] = "n"
         if presences[number] == "y" and thing_of_part(phrase):  # it may be another part
             presences[number] = scene.ask(phrase, checked=True).presences[0][0]
     return torch.cat(tables), presences
