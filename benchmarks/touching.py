@@ -62,7 +62,7 @@ def measured(path: str) -> dict:
 
 def upright(thing: Selection) -> np.ndarray:
     """The firm points of a thing, with z up."""
-    points, opacities = thing._points()
+    points, opacities = thing.points
     return points[opacities >= FAINT] @ np.stack(upright_frame(thing.up.direction)).T
 
 
