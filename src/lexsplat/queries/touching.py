@@ -40,7 +40,7 @@ _SLICE = 0.085
 """Half of the thickness of a slice there."""
 _NARROW, _THIN = 0.75, 0.55
 """Largest width of a neck, and largest product of its width and height, relative to the smaller piece."""
-_SIZES, _HEIGHTS = 2.0, 1.5
+_SIZES, _HEIGHTS = 1.7, 1.5
 """Largest ratio of the volumes of the hulls of two pieces, and of their heights."""
 _SPREADS = 0.25
 """Smallest ratio of the least spread of a piece to its greatest."""
