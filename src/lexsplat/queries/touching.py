@@ -31,7 +31,7 @@ _STRAYS = 0.03
 """Share of the points of a piece that are left out of its hull: those farthest from its middle."""
 _END = 0.05
 """Share of the points that lie beyond each end of a width or height."""
-_HOLE, _IN_HOLE = 0.5, 0.02
+_HOLE, _IN_HOLE = 0.42, 0.02
 """Pieces are those of a ring if they surround a hole of this radius, relative to their distance from its middle; this
 share of the points may lie in it."""
 _PLACES = np.linspace(0.3, 0.7, 7)
