@@ -140,16 +140,19 @@ class Journal:
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
         lines = [entry] if self._size else [self._header(), entry]
-        with naming(self.path), open(self.path, "a", encoding="utf-8") as file:
+        content = "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines).encode()
+        # Without a buffer: what a full disk refuses must not be written again when the file is closed.
+        with naming(self.path), open(self.path, "ab", buffering=0) as file:
             _lock(file)
             before = os.fstat(file.fileno()).st_size
             try:
                 self.check_unchanged()
-                file.write("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
-                file.flush()
+                rest = memoryview(content)
+                while rest:
+                    rest = rest[file.write(rest) :]
                 os.fsync(file.fileno())
-                self._size = os.fstat(file.fileno()).st_size
-            except (OSError, SceneFolderError):
+                self._size = before + len(content)
+            except BaseException:
                 if before:
                     os.truncate(self.path, before)
                 else:
