@@ -129,7 +129,8 @@ class Journal:
 
     def __init__(self, path: Path, scene: Scene) -> None:
         self.path, self._scene = path, scene
-        self._size = 0
+        self._size = self._whole = 0
+        """Bytes of the file, and of its complete lines."""
 
     def append(self, entry: dict[str, Any]) -> None:
         """Append a line and wait until it is on the disk, so that a later crash does not lose it.
@@ -139,7 +140,7 @@ class Journal:
             SceneFolderError: If another program has changed the file since it was read.
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        lines = [entry] if self._size else [self._header(), entry]
+        lines = [entry] if self._whole else [self._header(), entry]
         content = "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines).encode()
         # Without a buffer: what a full disk refuses must not be written again when the file is closed.
         with naming(self.path), open(self.path, "ab", buffering=0) as file:
@@ -147,15 +148,15 @@ class Journal:
             before = os.fstat(file.fileno()).st_size
             try:
                 self.check_unchanged()
+                before = self._size = file.truncate(self._whole)  # ends a last line that is cut off
                 rest = memoryview(content)
                 while rest:
                     rest = rest[file.write(rest) :]
                 os.fsync(file.fileno())
-                self._size = before + len(content)
+                self._size = self._whole = before + len(content)
             except BaseException:
-                if before:
-                    os.truncate(self.path, before)
-                else:
+                file.truncate(before)
+                if not before:
                     self.path.unlink(missing_ok=True)
                 raise
 
@@ -218,11 +219,9 @@ class Journal:
             raise FileFormatError(
                 self.path, expected="a readable journal", found=str(error), remedy="discard the edit"
             ) from error
+        self._size, self._whole = len(content), content.rfind(b"\n") + 1
         if lines[-1]:
             logging.getLogger("lexsplat").warning("%s: the last line is cut off and ignored", self.path)
-            content = "\n".join([*lines[:-1], ""]).encode()
-            self.path.write_bytes(content)
-        self._size = len(content)
         return lines[:-1]
 
     def _header(self) -> dict[str, Any]:
