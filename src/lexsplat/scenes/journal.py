@@ -10,7 +10,7 @@ import os
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -22,6 +22,8 @@ from lexsplat.scenes.filling import Fill
 from lexsplat.scenes.scene import Scene
 
 Kind = Literal["delete", "keep", "recolor", "move", "duplicate"]
+CHANGES: tuple[Kind, ...] = get_args(Kind)
+"""The kinds of steps."""
 JOURNAL_VERSION = 1
 _DEFLATE = 1032
 """Largest compression ratio of DEFLATE."""
