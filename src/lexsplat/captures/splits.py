@@ -60,7 +60,8 @@ def choose_test_names(
     else:
         chosen = set(annotated)
         if chosen and len(chosen) == len(names):
-            warnings.append(f"{root}: every view has ground truth; every {test_every}th is held out")
+            held_out = f"every {test_every}th" if test_every and len(names) > 1 else "none"
+            warnings.append(f"{root}: every view has ground truth; {held_out} is held out")
             chosen = set()
         if not chosen and test_every and len(names) > 1:
             chosen = set(names[::test_every])
