@@ -157,7 +157,9 @@ class TestSplit:
         save(tmp_path / "segmentations" / "0004" / "red_apple.png", np.ones((HEIGHT, WIDTH)))
         assert load_capture(tmp_path).test_names == (NAMES[3],)
 
-    @pytest.mark.parametrize(("test_every", "told", "held_out"), [(5, "every 5th", NAMES[::5]), (0, "none", [])])
+    @pytest.mark.parametrize(
+        ("test_every", "told", "held_out"), [(5, "every 5th", NAMES[::5]), (0, "none", [])]
+    )
     def test_ground_truth_for_every_view_holds_out_as_without(self, tmp_path, test_every, told, held_out):
         write_transforms(tmp_path, NAMES)
         for name in NAMES:

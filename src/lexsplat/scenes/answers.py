@@ -82,7 +82,9 @@ class Answers:
         if not self.words:
             return self._selection(index)
         word, present = self.words[index], self.presences[index]
-        made = word.selection = word.selection or self._selection(index)
+        if word.selection is None:  # an empty one is kept as well
+            word.selection = self._selection(index)
+        made = word.selection
         return made if made.present == present else made.described(present=present)
 
     def note(self, index: int) -> str:
