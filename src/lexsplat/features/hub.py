@@ -53,6 +53,9 @@ KEPT_FROM = 1 << 26
 _FRESH = 2.0
 """Seconds after a change in which another one might leave the time of the file as it is."""
 
+_MISTAKES = (ArithmeticError, AssertionError, AttributeError, LookupError, NameError, TypeError)
+"""Errors of the program, not of the network."""
+
 
 def present_name(name: str) -> str:
     """The name of a model; "embedded" is an alias of "bundled"."""
@@ -272,7 +275,7 @@ def _download(name: str, tower: str, lacking: str) -> Path:
         )
         _check_space(name, size, cache)
         folder = snapshot_download(name, revision=facts.sha, allow_patterns=files, etag_timeout=_HUB_TIMEOUT)
-    except ModelError:
+    except (ModelError, *_MISTAKES):
         raise
     except Exception as error:
         # A missing network raises many types, depending on the HTTP library and the proxy.
