@@ -10,7 +10,6 @@ import errno
 import logging
 import os
 import re
-import shutil
 import time
 from collections.abc import Collection, Iterable, Iterator
 from difflib import get_close_matches
@@ -22,7 +21,7 @@ from typing import Any
 from lexsplat.features.weights import INDEX, WEIGHTS, first_weights, read_config, weight_files
 from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.errors import ModelError
-from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.files import atomic_path, free_bytes
 from lexsplat.runtime.fingerprints import blocks, digest
 from lexsplat.runtime.progress import NOTE
 
@@ -320,8 +319,7 @@ def _check_complete(name: str, tower: str, names: Collection[str], wanted: Colle
 
 
 def _check_space(name: str, size: int, cache: Path) -> None:
-    place = next(path for path in (cache, *cache.parents) if path.exists())
-    free = shutil.disk_usage(place).free
+    free = free_bytes(cache)
     if free < size:
         raise _no_space(name, cache, f"{_megabytes(size)} of free space", _megabytes(free))
 
