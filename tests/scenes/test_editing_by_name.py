@@ -19,7 +19,7 @@ from lexsplat.scenes.scene import Scene
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def balls_to_edit() -> Scene:
     made = make_scene(per_ball=30)
     codes = torch.from_numpy(made.labels.astype(np.uint8))[:, None]
     field = CodeField(made.codebook, codes, torch.ones(150, 1), torch.zeros(150))
@@ -44,10 +44,10 @@ STEPS = {
 
 
 @pytest.mark.parametrize("action", STEPS)
-def test_an_action_by_its_name_is_that_of_the_method(scene, action):
-    named, called = Editor(scene), Editor(scene)
-    named.change(action, first(scene, 30), motion=TURNED, color=(1, 0, 0), strength=0.5, fill=False)
-    STEPS[action](called, first(scene, 30))
+def test_an_action_by_its_name_is_that_of_the_method(balls_to_edit, action):
+    named, called = Editor(balls_to_edit), Editor(balls_to_edit)
+    named.change(action, first(balls_to_edit, 30), motion=TURNED, color=(1, 0, 0), strength=0.5, fill=False)
+    STEPS[action](called, first(balls_to_edit, 30))
     tensors = called.scene.gaussians.tensors()
     assert all(torch.equal(tensors[name], value) for name, value in named.scene.gaussians.tensors().items())
     assert [str(step) for step in named.steps] == [str(step) for step in called.steps]
@@ -56,19 +56,19 @@ def test_an_action_by_its_name_is_that_of_the_method(scene, action):
 @pytest.mark.parametrize(
     ("action", "count", "left"), [("delete", 150, 0), ("delete", 149, 1), ("keep", 1, 1)]
 )
-def test_no_edit_leaves_a_scene_that_no_page_draws(scene, tmp_path, action, count, left):
-    editor = Editor(scene, tmp_path / "edits.jsonl")
+def test_no_edit_leaves_a_scene_that_no_page_draws(balls_to_edit, tmp_path, action, count, left):
+    editor = Editor(balls_to_edit, tmp_path / "edits.jsonl")
     told = f"{action}: expected at least 2 Gaussians after the edit, found {left}; select "
     with pytest.raises(QueryError, match=told):
-        editor.change(action, first(scene, count), fill=False)
+        editor.change(action, first(balls_to_edit, count), fill=False)
     assert (len(editor.scene.gaussians), editor.steps) == (150, [])
     assert not (tmp_path / "edits.jsonl").exists()
-    editor.change("keep", first(scene, 2))
+    editor.change("keep", first(balls_to_edit, 2))
     assert len(editor.scene.gaussians) == 2
 
 
-def test_a_turn_is_about_the_up_direction_of_the_selection_after_the_rotation(scene):
-    chosen = first(scene, 30)
+def test_a_turn_is_about_the_up_direction_of_the_selection_after_the_rotation(balls_to_edit):
+    chosen = first(balls_to_edit, 30)
     tilt = Rotation.from_euler("x", 20, degrees=True)
     values = Motion(rotation=tilt.as_matrix(), turn=90).values(chosen)
     about_up = Rotation.from_rotvec(np.radians(90) * chosen.up.direction)
@@ -85,10 +85,10 @@ def test_a_turn_is_about_the_up_direction_of_the_selection_after_the_rotation(sc
         ("duplicate", {"motion": Motion(scale=1e300)}, "duplicate: expected Gaussians that can be drawn"),
     ],
 )  # fmt: skip
-def test_values_without_meaning_are_refused_in_one_line(scene, action, values, told):
-    editor = Editor(scene)
+def test_values_without_meaning_are_refused_in_one_line(balls_to_edit, action, values, told):
+    editor = Editor(balls_to_edit)
     with pytest.raises(QueryError, match=told):
-        editor.change(action, first(scene, 30), **values)
+        editor.change(action, first(balls_to_edit, 30), **values)
     assert not editor.steps
 
 

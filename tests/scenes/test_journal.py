@@ -34,7 +34,7 @@ def phrases(path: Path) -> list[str]:
 
 
 @pytest.fixture
-def limited():
+def small_files():
     """Runs a function so that no file can become larger than so many bytes: a full disk without a mount."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     told = signal.signal(
@@ -54,24 +54,26 @@ def limited():
 
 @pytest.mark.parametrize("size", [0, 3_000, 100_000])
 @pytest.mark.parametrize("room", [0, 1, 60])
-def test_a_step_that_a_full_disk_refuses_leaves_the_earlier_steps_as_they_were(tmp_path, limited, size, room):
+def test_a_step_that_a_full_disk_refuses_leaves_the_earlier_steps_as_they_were(
+    tmp_path, small_files, size, room
+):
     path = tmp_path / "edits.jsonl"
     journal = Journal(path, SCENE)
     journal.append(step("mug"))
     journal.append(step("apple"))
     before = path.read_bytes()
     with pytest.raises(OSError, match=r"edits\.jsonl"):
-        limited(len(before) + room, journal.append, step("lamp", size))
+        small_files(len(before) + room, journal.append, step("lamp", size))
     assert path.read_bytes() == before
     assert phrases(path) == ["mug", "apple"]
     journal.append(step("pear"))  # there is room again
     assert phrases(path) == ["mug", "apple", "pear"]
 
 
-def test_a_first_step_that_a_full_disk_refuses_leaves_no_file(tmp_path, limited):
+def test_a_first_step_that_a_full_disk_refuses_leaves_no_file(tmp_path, small_files):
     path = tmp_path / "edits.jsonl"
     with pytest.raises(OSError, match=r"edits\.jsonl"):
-        limited(100, Journal(path, SCENE).append, step("mug", 3_000))
+        small_files(100, Journal(path, SCENE).append, step("mug", 3_000))
     assert not path.exists()
 
 
@@ -147,13 +149,13 @@ def test_a_journal_of_which_only_a_part_of_the_header_was_written_begins_anew(tm
     assert phrases(path) == ["mug"]
 
 
-def test_a_full_disk_leaves_the_complete_lines_of_a_journal_that_is_cut_off(tmp_path, limited):
+def test_a_full_disk_leaves_the_complete_lines_of_a_journal_that_is_cut_off(tmp_path, small_files):
     path = tmp_path / "edits.jsonl"
     cut_off(path)
     journal = Journal(path, SCENE)
     journal.read()
     with pytest.raises(OSError, match=r"edits\.jsonl"):
-        limited(path.stat().st_size + 50, journal.append, step("lamp", 3_000))
+        small_files(path.stat().st_size + 50, journal.append, step("lamp", 3_000))
     assert phrases(path) == ["mug"]
     journal.append(step("pear"))
     assert phrases(path) == ["mug", "pear"]
