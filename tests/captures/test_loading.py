@@ -157,6 +157,17 @@ class TestSplit:
         save(tmp_path / "segmentations" / "0004" / "red_apple.png", np.ones((HEIGHT, WIDTH)))
         assert load_capture(tmp_path).test_names == (NAMES[3],)
 
+    @pytest.mark.parametrize(
+        ("test_every", "told", "held_out"), [(5, "every 5th", NAMES[::5]), (0, "none", [])]
+    )
+    def test_ground_truth_for_every_view_holds_out_as_without(self, tmp_path, test_every, told, held_out):
+        write_transforms(tmp_path, NAMES)
+        for name in NAMES:
+            save(tmp_path / "segmentations" / name[:-4] / "apple.png", np.ones((HEIGHT, WIDTH)))
+        capture = load_capture(tmp_path, test_every=test_every)
+        assert list(capture.test_names) == held_out
+        assert capture.warnings[-1] == f"{tmp_path}: every view has ground truth; {told} is held out"
+
     def test_test_views_json_comes_before_segmentations(self, tmp_path):
         write_transforms(tmp_path, NAMES)
         save(tmp_path / "segmentations" / "0004" / "apple.png", np.ones((HEIGHT, WIDTH)))

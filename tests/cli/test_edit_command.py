@@ -252,3 +252,10 @@ def test_a_damaged_journal_has_no_steps_to_note(tmp_path, content):
     folder = SceneFolder(tmp_path)
     (tmp_path / "edits.jsonl").write_bytes(content)
     assert unsaved_steps(folder) == 0
+
+
+@pytest.mark.parametrize("damage", ['{"step": "del', "[]", "{}{}"])
+def test_the_steps_before_a_damaged_line_are_noted(tmp_path, damage):
+    lines = ['{"journal": 1}', '{"step": "delete"}', '{"step": "move"}', damage, '{"step": "keep"}', ""]
+    (tmp_path / "edits.jsonl").write_text("\n".join(lines))
+    assert unsaved_steps(SceneFolder(tmp_path)) == 2

@@ -220,6 +220,25 @@ def test_a_closed_pipe_ends_a_command_quietly(arguments):
     assert process.returncode == 0
 
 
+@pytest.mark.slow
+def test_a_build_whose_progress_nobody_reads_any_more_is_stopped_and_says_so(tiny_capture, tmp_path):
+    command = [
+        sys.executable, "-m", "lexsplat", "build", str(tiny_capture), "--output", str(tmp_path / "scene"),
+        "--progress", "json", "--clip", "bundled", "--dino", "none", "--device", "cpu", "--iterations", "6",
+    ]  # fmt: skip
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.readline()
+        process.stdout.close()  # as `| head -1` does
+        error = process.stderr.read()
+    told = [line for line in error.splitlines() if "error: " in line]
+    assert process.returncode == 1, error
+    assert len(told) == 1, error
+    assert (
+        "lexsplat build: expected a reader of its output until it ends, found a closed pipe; run" in told[0]
+    )
+    assert "Traceback" not in error
+
+
 def run_elsewhere(arguments: list[str]) -> subprocess.CompletedProcess:
     """A command in a process of its own, which prints the loaded modules at its end."""
     code = (

@@ -153,6 +153,14 @@ def test_several_seeds_give_mean_and_standard_deviation():
     assert "±" not in table.splitlines()[-1]
 
 
+def test_the_time_of_language_counts_neither_cameras_nor_gaussians_nor_features():
+    result = results_of_three_seeds()[0]
+    stages = {"poses": 100, "views": 5, "features": 20, "reconstruct": 200, "codebook": 3, "language": 7}
+    (row,) = table_rows({"one": {**result, "speed": {**result["speed"], "stage_seconds": stages}}})
+    assert row["language_seconds"] == [3 + 7]
+    assert row["training_seconds"] == [20 + 200 + 3 + 7]
+
+
 def test_the_headline_of_a_comparison_names_the_best_method_and_never_the_reference(tmp_path):
     worst, middle, best = results_of_three_seeds()
     results = {"<b>trained</b>": [worst], "averaged": [middle], "nearest": [best]}

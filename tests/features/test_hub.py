@@ -214,6 +214,21 @@ def test_each_cause_has_its_own_message(fake):
     refused("cache", "a full disk", "HF_HOME")
 
 
+@pytest.mark.parametrize("kind", [TypeError, AttributeError, KeyError, IndexError, NameError, AssertionError])
+def test_a_mistake_of_the_program_is_not_reported_as_a_hub_that_cannot_be_reached(fake, kind):
+    for place in ("error", "late_error"):
+        fake.error = fake.late_error = None
+        setattr(fake, place, kind("a mistake"))
+        with pytest.raises(kind, match="a mistake"):
+            load_clip("someone/model")
+
+
+@pytest.mark.parametrize("error", [RuntimeError("xet failed"), ValueError("no JSON"), TimeoutError("10 s")])
+def test_errors_of_transports_of_any_type_are_reported_as_a_hub_that_cannot_be_reached(fake, error):
+    fake.late_error = error
+    refused(f"the hub cannot be reached ({type(error).__name__})")
+
+
 def test_a_disk_without_enough_space_is_reported_before_the_download(fake, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=10_000_000))
     refused("600 MB of free space", "found 10 MB", "HF_HOME")

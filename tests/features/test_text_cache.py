@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 import torch
 from support.counting_encoders import ColorEncoder
 
 from lexsplat.features import TextCache, text
-from lexsplat.runtime.files import write_tensors
+from lexsplat.runtime.files import read_tensors, write_tensors
 
 
 def test_a_prompt_is_encoded_once_and_cached_on_disk(tmp_path):
@@ -150,3 +152,23 @@ def test_texts_that_follow_at_once_are_written_together_when_the_cache_is_let_go
     assert len(writes) == 2
     TextCache(tmp_path).encode("color", ["a", "b", "c"], lambda: counter)
     assert counter.texts == 0, "all is on the disk"
+
+
+def test_texts_that_another_thread_adds_while_the_file_is_written_do_not_spoil_it(tmp_path, monkeypatch):
+    cache, stack, added = TextCache(tmp_path), torch.stack, []
+
+    def slow_stack(vectors):
+        stacked = stack(vectors)
+        with monkeypatch.context() as patch:  # the moment at which the other thread asks
+            patch.setattr(torch, "stack", stack)
+            added.append(f"pear {len(added)}")
+            cache.encode("color", [added[-1]], ColorEncoder)
+        return stacked
+
+    monkeypatch.setattr(torch, "stack", slow_stack)
+    cache.encode("color", ["apple", "red apple"], ColorEncoder)
+    assert added
+    tensors, facts = read_tensors(tmp_path / "text-color.safetensors")
+    texts = json.loads(facts["texts"])
+    assert {"apple", "red apple"} <= set(texts)
+    torch.testing.assert_close(tensors["embeddings"], ColorEncoder().encode_text(texts))

@@ -102,6 +102,25 @@ def test_photos_are_registered_once_until_a_setting_changes(photos, room_scene, 
     assert model.stat().st_mtime_ns != before
 
 
+def test_copied_photos_keep_their_cameras_and_a_replaced_photo_of_the_same_size_does_not(
+    photos, room_scene, tmp_path
+):
+    copy = shutil.copytree(room_scene, tmp_path / "copy")
+    moved = shutil.copytree(photos, tmp_path / "moved", copy_function=shutil.copyfile)  # with other times
+    model = copy / "poses" / "sparse" / "0" / "images.bin"
+    before = model.stat().st_mtime_ns
+    assert run("reconstruct", moved, copy) == 0
+    assert model.stat().st_mtime_ns == before
+    photo = moved / "unrelated.png"
+    size = photo.stat().st_size
+    save(photo, np.zeros((SIZE[1], SIZE[0], 3)))
+    content = photo.read_bytes()
+    photo.write_bytes(content + bytes(size - len(content)))  # readers ignore what follows the image
+    assert photo.stat().st_size == size
+    assert run("reconstruct", moved, copy) == 0
+    assert model.stat().st_mtime_ns != before
+
+
 def test_an_output_that_is_the_photos_folder_is_refused(photos, capsys):
     assert run("reconstruct", photos, photos) == 1
     assert "--output" in capsys.readouterr().err

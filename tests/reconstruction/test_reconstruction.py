@@ -12,6 +12,7 @@ from support.held_out import held_out_psnr
 from lexsplat.captures import load_capture
 from lexsplat.captures.sfm.triangulation import InitialPoints
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor, reconstruct
+from lexsplat.rendering import render
 from lexsplat.runtime.errors import TrainingError
 
 SHORT = ReconstructionConfig(
@@ -320,3 +321,44 @@ def test_the_learning_rate_of_the_means_decays_to_a_hundredth(capture, points):
     first = trainer._means_rate()
     trainer.steps_done = SHORT.iterations
     assert trainer._means_rate() == pytest.approx(first / 100)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_psnr_of_a_training_is_that_of_the_unmasked_pixels(tiny_capture, tmp_path, points, masked):
+    folder = shutil.copytree(tiny_capture, tmp_path / "capture")
+    for file in (folder / "images").iterdir() if masked else ():
+        (folder / "masks").mkdir(exist_ok=True)
+        mask = np.zeros(np.asarray(Image.open(file)).shape[:2], np.uint8)
+        mask[10:30, 20:40] = 255
+        Image.fromarray(mask).save(folder / "masks" / file.name)
+    capture = load_capture(folder)
+    trainer = Reconstructor(capture, dataclasses.replace(SHORT, warm_up=0.0), points)
+    before = trainer.gaussians()
+    before = before.select(torch.arange(len(before)))  # a copy: the step changes the parameters in place
+    trainer.step()
+    view = capture.views[trainer.last_view]
+    background = torch.tensor(capture.background, dtype=torch.float32)
+    image = render(before, view.camera, sh_degree=0, background=background).image.numpy()
+    errors = (image.astype(float) - view.load_image()) ** 2
+    counted = errors[10:30, 20:40] if masked else errors
+    assert trainer.metrics["psnr"] == pytest.approx(-10 * np.log10(counted.mean()), abs=1e-3)
+    nothing = (np.array(capture.background) - view.load_image()) ** 2
+    counted = nothing[10:30, 20:40] if masked else nothing
+    assert float(trainer.state_dict()["nothing_error"]) == pytest.approx(counted.mean(), rel=1e-4)
+
+
+def test_a_photo_that_is_masked_everywhere_says_nothing_about_the_psnr(
+    capture, tiny_capture, tmp_path, points
+):
+    folder = shutil.copytree(tiny_capture, tmp_path / "capture")
+    (folder / "masks").mkdir()
+    shown = capture.train_names[0]
+    for file in (folder / "images").iterdir():
+        size = Image.open(file).size
+        Image.new("L", size, 255 * (file.name == shown)).save(folder / "masks" / file.name)
+    trainer = Reconstructor(load_capture(folder), SHORT, points)
+    for _ in capture.train_names:
+        before = trainer.state_dict()["recent_error"]
+        trainer.step()
+        changed = not trainer.state_dict()["recent_error"].allclose(before, rtol=0, equal_nan=True)
+        assert changed == (trainer.last_view == shown)

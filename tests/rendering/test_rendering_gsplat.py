@@ -163,6 +163,32 @@ def test_an_extension_that_fails_to_compile_is_reported_in_one_line(monkeypatch,
         gsplat_backend.require_gsplat()
 
 
+def test_of_a_compiler_that_fails_the_errors_are_reported_and_everything_is_logged(monkeypatch, caplog):
+    output = "\n".join(
+        [
+            "Error building extension 'gsplat_cuda': [1/12] /usr/local/cuda/bin/nvcc -I include "
+            + "-DX " * 90,
+            "FAILED: ProjectionEWA.cuda.o",
+            "nvcc --generate-dependencies " + "-DY " * 90,
+            "/usr/include/glm/glm.hpp(12): fatal error: no such file or directory",
+            "compilation terminated.",
+            "ninja: build stopped: subcommand failed.",
+        ]
+    )
+
+    class Backend(types.ModuleType):
+        @property
+        def _C(self):
+            raise RuntimeError(output)
+
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", Backend("gsplat.cuda._backend"))
+    with caplog.at_level("DEBUG"), pytest.raises(BackendError) as caught:
+        gsplat_backend.require_gsplat()
+    assert "glm.hpp(12): fatal error: no such file or directory; install a wheel" in str(caught.value)
+    assert len(caught.value.found) < 400
+    assert output in caplog.text
+
+
 def test_gsplats_compiler_messages_are_not_printed(monkeypatch, capsys):
     class Talkative(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         def find_spec(self, name, path=None, target=None):

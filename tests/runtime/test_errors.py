@@ -1,4 +1,6 @@
 import pickle
+import re
+from pathlib import Path
 
 import pytest
 
@@ -41,3 +43,11 @@ def test_errors_survive_the_way_between_processes(kind):
 def test_there_is_one_base_to_catch():
     assert len(KINDS) >= 7
     assert not issubclass(LexsplatError, ValueError)
+
+
+def test_the_page_about_the_api_lists_every_error_and_no_other():
+    text = (Path(__file__).parents[2] / "docs" / "api.md").read_text(encoding="utf-8")
+    section = text.split("\n## Exceptions\n", 1)[1].split("\n## ", 1)[0]
+    assert sorted(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)) == sorted(
+        kind.__name__ for kind in KINDS
+    )

@@ -178,3 +178,16 @@ def test_written_files_have_the_permissions_of_the_umask(tmp_path, umask, expect
         os.umask(before)
     for name in ("tensors", "json", "text"):
         assert stat.S_IMODE((tmp_path / name).stat().st_mode) == expected
+
+
+def test_the_free_space_of_a_folder_is_that_of_its_disk_and_of_the_limit_of_file_sizes(tmp_path):
+    resource = pytest.importorskip("resource", reason="no limit of file sizes on this system")
+    status = os.statvfs(tmp_path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    free = files.free_bytes(tmp_path / "not" / "there" / "yet")
+    assert free == pytest.approx(status.f_bavail * status.f_frsize, rel=0.1)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (12_345, before[1]))
+        assert files.free_bytes(tmp_path) == 12_345
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -9,6 +9,7 @@ from PIL import Image
 from support.viewer_scene import BallScene, ball_scene
 
 from lexsplat.scenes.answers import Answers, answer_queries, file_name
+from lexsplat.scenes.words import Word
 
 PROMPTS = ["ball 0", "ball 3"]
 
@@ -28,6 +29,19 @@ def test_only_an_automatic_threshold_leaves_out_what_convinces_less(automatic, k
     assert np.array_equal(found.mask.numpy(), np.isin(known.labels, kept))
     assert (found.threshold, found.phrase, found.present) == (0.5, "ball", "yes")
     assert answers.to_dict() == {"answers": [found.to_dict()]}
+
+
+@pytest.mark.parametrize("score", [0.9, 0.1])
+def test_a_selection_is_made_once_even_if_it_is_empty(scene, monkeypatch, score):
+    scores = torch.full((len(scene.gaussians),), score)
+    word = Word(scores, scores, "yes" if score > 0.5 else "no")
+    answers = Answers(("ball",), scores[None], torch.tensor([0.5]), (word.presence,), scene, words=(word,))
+    made, make = [], Answers._selection
+    monkeypatch.setattr(Answers, "_selection", lambda self, index: made.append(index) or make(self, index))
+    first = answers.selection(0)
+    assert bool(first) == (score > 0.5)
+    assert answers.selection(0) is first
+    assert made == [0]
 
 
 def test_a_query_states_the_peak_of_each_view_and_the_best_of_them(scene, tmp_path):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from lexsplat.geometry.cameras import look_at
-from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
-from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.folder import SceneFolder, StoredView, view_named
 
 
 def test_a_stage_is_finished_only_for_the_same_inputs(tmp_path):
@@ -108,3 +108,40 @@ def test_a_working_directory_with_other_files_is_no_output(tmp_path, monkeypatch
     folder = SceneFolder(tmp_path / "elsewhere")
     folder.root.mkdir()
     folder.refuse_foreign_files()
+
+
+def views_of(*names: str) -> dict[str, StoredView]:
+    camera = look_at([0, -3, 1], [0, 0, 0], [0, 0, 1], 32, 24, 0.8)
+    return {name: StoredView(name, camera, "train") for name in names}
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("x.jpg", "x.jpg"),
+        ("x", "x.jpg"),
+        ("a.b", "a.b.png"),
+        ("left/0001", "left/0001.jpg"),
+        ("0001.png", "right/0001.png"),
+        ("0002", "right/0002.png"),
+    ],
+)
+def test_a_view_is_named_with_or_without_its_folder_and_its_suffix(name, found):
+    views = views_of("x.jpg", "a.b.png", "left/0001.jpg", "right/0001.png", "right/0002.png")
+    assert view_named(views, name).name == found
+
+
+@pytest.mark.parametrize(
+    ("name", "views", "found"),
+    [
+        ("photos_of_another_capture/view_033", ("view_033.jpg",), "no match"),
+        ("left/0001", ("right/0001.jpg",), "no match"),
+        ("x.v2", ("x.jpg",), "no match"),
+        ("x.png", ("x.jpg",), "no match"),
+        ("0001", ("left/0001.jpg", "right/0001.jpg"), "2 matches"),
+        ("", ("x.jpg",), "no match"),
+    ],
+)
+def test_a_folder_or_suffix_that_is_given_must_be_that_of_the_view(name, views, found):
+    with pytest.raises(QueryError, match=f"found {found}; the scene has {len(views)} views, such as "):
+        view_named(views_of(*views), name)

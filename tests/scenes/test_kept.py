@@ -12,6 +12,8 @@ from lexsplat.geometry.world import World
 from lexsplat.queries.phrases import Thing, Understood
 from lexsplat.queries.relevancy import QueryConfig
 from lexsplat.rendering import render
+from lexsplat.runtime.errors import ModelError
+from lexsplat.runtime.progress import NOTE
 from lexsplat.scenes import kept as kept_files
 from lexsplat.scenes.answers import answer_queries, find_phrase
 from lexsplat.scenes.editing import Editor
@@ -222,6 +224,26 @@ def test_a_damaged_file_or_one_of_another_scene_counts_as_none(demo_copy):
     scene = open_scene(demo_copy, device="cpu")
     scene.gaussians.means[0, 0] += 1  # before it is asked
     assert not scene.seen.complete
+
+
+def test_a_full_disk_is_noted_where_a_missing_encoder_is_not(demo_copy, monkeypatch, caplog):
+    def failing(error):
+        def write(*_):
+            raise error
+
+        return write
+
+    shutil.rmtree(demo_copy / "checkpoints")
+    for error, told in (
+        (OSError(28, "No space left on device"), True),
+        (ModelError("model x", found="no such folder"), False),
+    ):
+        caplog.clear()
+        monkeypatch.setattr("lexsplat.scenes.kept.write_tensors", failing(error))
+        with caplog.at_level(NOTE):
+            keep(open_scene(demo_copy, device="cpu"))
+        expected = "checkpoints: what the first questions need is not kept; they compute it (No space left on device)"
+        assert [message.endswith(expected) for message in caplog.messages] == ([True] if told else [])
 
 
 def test_edited_content_does_not_take_what_is_kept_of_the_scene(demo):

@@ -375,3 +375,26 @@ def test_every_field_of_a_record_is_kept_twice(rooms):
         == record.sealed()
         == read_json(rooms / "library" / "scenes" / "kitchen.json")
     )
+
+
+def test_damaged_codes_stay_reported_while_other_questions_read_the_record(rooms_copy):
+    """The record is whole: who reads it says nothing about the codes, which another thread has found damaged."""
+    (file,) = (rooms_copy / "library" / "scenes").glob("kitchen.*.safetensors")
+    damage(file)
+    library = Library(rooms_copy / "library")
+    assert library.codes(library.record("kitchen")) is None
+    library.record("kitchen"), library.records()  # as the question of another thread does
+    assert "damaged" in str(library.damaged["kitchen"])
+    damage(file)  # the same bit once more
+    assert library.codes(library.record("kitchen")) is not None
+    assert library.damaged == {}
+
+
+def test_damaged_codes_are_no_longer_reported_once_the_scene_is_added_again(rooms_copy):
+    (file,) = (rooms_copy / "library" / "scenes").glob("kitchen.*.safetensors")
+    damage(file)
+    library = Library(rooms_copy / "library")
+    assert library.codes(library.record("kitchen")) is None
+    Library(rooms_copy / "library").add(rooms_copy / "kitchen")
+    library.record("kitchen")
+    assert library.damaged == {}

@@ -268,7 +268,7 @@ def test_steps_are_kept_in_the_journal_of_the_edit_command(built, tmp_path):
     scene = open_scene(folder)
     session = Session(scene, 1_000_000, History())
     everything = scene.select("red mug", 0.0)
-    session._change("recolor", everything, {"color": [0, 0, 1]})
+    session.editor.change("recolor", everything, color=[0, 0, 1])
     again = Session(open_scene(folder), 1_000_000, History())
     assert len(again.content.manifest["server"]["steps"]) == 1
     with Editor(open_scene(folder), folder / "edits.jsonl").journal.path.open("a") as journal:

@@ -16,13 +16,15 @@ SPLIT_FILE = "test_views.json"
 def match_stem(stem: str, names: Iterable[str]) -> list[str]:
     """The image names a stem can refer to: those with this full stem, else those with this last path component.
 
-    A full name with suffix is its own stem. More than one result means that the stem is ambiguous.
+    A folder or suffix that is given must be that of the image. More than one result means that the stem is ambiguous.
     """
     names = list(names)
     exact = [name for name in names if stem in (name, stem_of(name))]
     if exact:
         return [stem] if stem in exact else exact
-    return [name for name in names if stem_of(name).rpartition("/")[2] == stem]
+    last = [(name, name.rpartition("/")[2]) for name in names]
+    exact = [name for name, file in last if file == stem]
+    return exact or [name for name, file in last if stem_of(file) == stem]
 
 
 def choose_test_names(
@@ -58,7 +60,8 @@ def choose_test_names(
     else:
         chosen = set(annotated)
         if chosen and len(chosen) == len(names):
-            warnings.append(f"{root}: every view has ground truth; every {test_every}th is held out")
+            held_out = f"every {test_every}th" if test_every and len(names) > 1 else "none"
+            warnings.append(f"{root}: every view has ground truth; {held_out} is held out")
             chosen = set()
         if not chosen and test_every and len(names) > 1:
             chosen = set(names[::test_every])

@@ -62,6 +62,9 @@ _REMEDIES = {
 }
 """Remedies for errors of the system, by their numbers."""
 
+_PRINTING = ("query", "find", "list", "ask", "library", "encoders", "info")
+"""Commands that have nothing left to do but to print when they begin to."""
+
 ALIASES = {"embed": "language"}
 """Other names of commands."""
 
@@ -89,8 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(STOPPED, file=sys.stderr)
         return 130  # as shells report Ctrl-C
     except BrokenPipeError:
-        # The reader of the output has ended, as in `lexsplat info SCENE | head`: the rest is discarded.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # The reader of the output has ended, as in `lexsplat info SCENE | head`: nothing else was left to do.
+        _discard_output()
         return 0
     except (MemoryError, RuntimeError) as error:
         # torch raises RuntimeError where Python raises MemoryError.
@@ -141,8 +144,24 @@ def _run(words: list[str]) -> int:
 
         kind = getattr(importlib.import_module(f"lexsplat.cli.{entry.module}"), entry.name)
         command = parse(kind, name, rest)
-    command.run()
+    try:
+        command.run()
+    except BrokenPipeError as error:
+        if name in _PRINTING:
+            raise
+        _discard_output()
+        raise LexsplatError(
+            f"lexsplat {name}",
+            expected="a reader of its output until it ends",
+            found="a closed pipe",
+            remedy="run the same command again, with its output read to the end or written to a file",
+        ) from error
     return 0
+
+
+def _discard_output() -> None:
+    """Write the rest of the output to nowhere: at its end Python would report the closed pipe once more."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def overview() -> str:

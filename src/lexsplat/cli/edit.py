@@ -184,28 +184,12 @@ class Edit:
         journal.unlink()
 
     def _change(self, editor: Editor) -> None:
-        from lexsplat.geometry.rotations import rotation_about
         from lexsplat.scenes.editing import Motion
 
         chosen = editor.scene.find(self.select or "", self.view, threshold=self.threshold)
         chosen = chosen.largest() if self.largest else chosen
         chosen = chosen.grow(self.grow) if self.grow is not None else chosen
         chosen = chosen.shrink(self.shrink) if self.shrink is not None else chosen
-        try:
-            with uncounted(editor.original.listener, "steps"):
-                if self.action == "recolor" and self.color:
-                    editor.recolor(chosen, self.color, self.strength)
-                elif self.action in ("move", "duplicate"):
-                    motion = Motion(self.by, rotation_about(chosen.up.direction, self.turn), self.scale)
-                    if self.action == "move":
-                        editor.move(chosen, motion, self.fill)
-                    else:
-                        editor.duplicate(chosen, motion)
-                elif self.action == "delete":
-                    editor.delete(chosen, self.fill)
-                else:
-                    editor.keep(chosen)
-        except ValueError as error:  # numbers that are only invalid together or for these Gaussians
-            raise QueryError(
-                self.action, expected="Gaussians that can be drawn after the edit", found=str(error)
-            ) from error
+        motion = Motion(self.by, scale=self.scale, turn=self.turn)
+        with uncounted(editor.original.listener, "steps"):
+            editor.change(self.action, chosen, motion, self.color or (), self.strength, self.fill)

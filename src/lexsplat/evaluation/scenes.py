@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lexsplat.captures import Capture
+from lexsplat.captures import Capture, stem_of
 from lexsplat.captures.ground_truth.layouts import load_annotations
 from lexsplat.captures.ground_truth.prompt_lists import PromptList
 from lexsplat.evaluation.ground_truth import GroundTruthSource, read_held_out
@@ -145,8 +145,7 @@ def _write_results(root: Path, metrics: Metrics, gallery: Gallery, title: str) -
     write_rows(root, "metrics", table_rows({title: result}))
     write_report(root / "report.html", metrics, gallery, title=title)
     for (view, prompt), images in gallery.cases.items():
-        stem = Path(view).with_suffix("")
-        path = root / "heatmaps" / file_name(prompt) / stem.with_name(stem.name + ".jpg")
+        path = root / "heatmaps" / file_name(prompt) / f"{stem_of(view)}.jpg"
         with atomic_path(path) as temporary:
             temporary.write_bytes(images["heatmap"])
 

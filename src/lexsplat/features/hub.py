@@ -10,7 +10,6 @@ import errno
 import logging
 import os
 import re
-import shutil
 import time
 from collections.abc import Collection, Iterable, Iterator
 from difflib import get_close_matches
@@ -22,7 +21,7 @@ from typing import Any
 from lexsplat.features.weights import INDEX, WEIGHTS, first_weights, read_config, weight_files
 from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.errors import ModelError
-from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.files import atomic_path, free_bytes
 from lexsplat.runtime.fingerprints import blocks, digest
 from lexsplat.runtime.progress import NOTE
 
@@ -52,6 +51,9 @@ KEPT_FROM = 1 << 26
 """Bytes of a model from which its hash is kept; below, it takes a tenth of a second."""
 _FRESH = 2.0
 """Seconds after a change in which another one might leave the time of the file as it is."""
+
+_MISTAKES = (ArithmeticError, AssertionError, AttributeError, LookupError, NameError, TypeError)
+"""Errors of the program, not of the network."""
 
 
 def present_name(name: str) -> str:
@@ -272,7 +274,7 @@ def _download(name: str, tower: str, lacking: str) -> Path:
         )
         _check_space(name, size, cache)
         folder = snapshot_download(name, revision=facts.sha, allow_patterns=files, etag_timeout=_HUB_TIMEOUT)
-    except ModelError:
+    except (ModelError, *_MISTAKES):
         raise
     except Exception as error:
         # A missing network raises many types, depending on the HTTP library and the proxy.
@@ -317,8 +319,7 @@ def _check_complete(name: str, tower: str, names: Collection[str], wanted: Colle
 
 
 def _check_space(name: str, size: int, cache: Path) -> None:
-    place = next(path for path in (cache, *cache.parents) if path.exists())
-    free = shutil.disk_usage(place).free
+    free = free_bytes(cache)
     if free < size:
         raise _no_space(name, cache, f"{_megabytes(size)} of free space", _megabytes(free))
 

@@ -130,7 +130,7 @@ class TextCache:
         found: dict[str, Tensor] = {}
         for store in reversed(self._read):
             known = store.read(content_hash)
-            found.update((prompt, known[prompt]) for prompt in wanted if prompt in known)
+            found.update((each, vector) for each in wanted if (vector := known.get(each)) is not None)
         if len({len(vector) for vector in found.values()}) > 1:
             found = {}  # one of the files was made by something else
         new = [prompt for prompt in wanted if prompt not in found]
@@ -185,7 +185,7 @@ class _Store:
             return
         known.update(new)
         for text in list(known)[:-_MAX_STORED]:
-            del known[text]
+            known.pop(text, None)  # unless another thread has dropped it
         if time.monotonic() < self._written.get(content_hash, -math.inf) + _WRITES_APART:
             self._unwritten.add(content_hash)
             return
@@ -212,8 +212,9 @@ def _path(folder: Path, content_hash: str) -> Path:
 
 def _write(folder: Path, content_hash: str, known: dict[str, Tensor]) -> None:
     try:
-        vectors = torch.stack(list(known.values()))
-        facts = {"texts": json.dumps(list(known)), "width": str(vectors.shape[1])}
+        texts, rows = zip(*known.copy().items())  # other threads may add to it meanwhile
+        vectors = torch.stack(rows)
+        facts = {"texts": json.dumps(texts), "width": str(vectors.shape[1])}
         write_tensors(_path(folder, content_hash), {"embeddings": vectors}, facts, lasting=False)
     except OSError as error:  # the cache is optional
         log.warning("%s: text embeddings are not cached (%s)", folder, error.strerror)

@@ -89,10 +89,7 @@ class WritingTools(Tools):
                 remedy="look at it with render, then edit with confirm=true, or name it in other words",
             )
         editor = Editor(place)
-        if action == "recolor":
-            editor.recolor(found, color)
-        else:
-            getattr(editor, action)(found)
+        editor.change(action, found, color=color)
         count = int(editor.steps[-1].mask.sum())
         with _writing(path):
             saved = editor.save(path)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,7 +42,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError, SceneFolderError
-from lexsplat.runtime.fingerprints import fingerprint
+from lexsplat.runtime.fingerprints import file_sample, fingerprint
 from lexsplat.runtime.progress import NOTE, Listener, kept_warnings, warn_again
 from lexsplat.scenes.folder import SceneFolder
 
@@ -237,6 +238,8 @@ def _registered_images(
     poses, memory = folder.root / "poses", config.memory_bytes
     key = _photos_fingerprint(source, photos, folder.root, config)
     images = folder.record["stages"].get("poses", {}).get("images")
+    if images is not None and Path(images).is_absolute():
+        images = str(photos.resolve())  # where they are now
     kept = images is not None and (folder.root / images).is_dir() and (poses / "sparse" / "0").is_dir()
     if kept and folder.is_finished("poses", key):
         warn_again(folder.record["stages"]["poses"])
@@ -268,19 +271,18 @@ def _registered_images(
 
 
 def _photos_fingerprint(source: Path, photos: Path, output: Path, config: BuildConfig) -> str:
-    """Fingerprint of the inputs of structure from motion: photos (name, size), masks (also time), settings."""
+    """Fingerprint of the inputs of structure from motion: photos or a video, masks, settings.
+
+    Of files their names and samples (`file_sample`): a copy of a capture has the cameras of the original.
+    """
     settings: list[Any] = [config.poses, config.seed]
     if is_video(source):
         if not source.is_file():
             raise CaptureError(source, expected="a video", found="no such file", remedy="check the path")
-        return fingerprint(settings, source.name, source.stat().st_size, config.frames)
+        return fingerprint(settings, source.name, file_sample(source), config.frames)
     masks = [path for folder in mask_places(photos) for path in sorted(folder.rglob("*")) if path.is_file()]
-    names = find_photos(photos, output)
-    return fingerprint(
-        settings,
-        [[name, (photos / name).stat().st_size] for name in names],
-        [[str(path), path.stat().st_size, path.stat().st_mtime_ns] for path in masks],
-    )
+    paths = [*(photos / name for name in find_photos(photos, output)), *masks]
+    return fingerprint(settings, [[os.path.relpath(path, photos), file_sample(path)] for path in paths])
 
 
 def reload_capture(folder: SceneFolder, source: Path | None = None) -> Capture:

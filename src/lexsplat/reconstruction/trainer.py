@@ -190,7 +190,7 @@ class Reconstructor:
                 found=f"{value} at iteration {self.steps_done + 1}",
                 remedy="check the cameras, or lower the learning rates",
             )
-        self._update_errors(name, image, target.image)
+        self._update_errors(name, image, target.image, valid)
         self._optimize()
         self._control_density(rendering.means2d, rendering.radii, (camera.width, camera.height))
         self.last_view = name
@@ -354,17 +354,17 @@ class Reconstructor:
         """Whether step ``done`` reads its loss: always on a CPU, every few steps on CUDA, where reading waits."""
         return self.device.type == "cpu" or done % EVENT_EVERY == 0 or done == self.config.iterations
 
-    def _update_errors(self, name: str, image: Tensor, target: Tensor) -> None:
-        """Update the running mean squared errors of the renderings and of the bare background.
+    def _update_errors(self, name: str, image: Tensor, target: Tensor, valid: Tensor | None) -> None:
+        """Update the running mean squared errors of the renderings and of the bare background, at unmasked pixels.
 
         Raises:
             TrainingError: If the renderings are much worse than the background, which means divergence.
         """
-        if not self.reads_loss(self.steps_done + 1):
+        if not self.reads_loss(self.steps_done + 1) or (valid is not None and not valid.any()):
             return
         if name not in self._background_errors:
-            self._background_errors[name] = _mean_square(self._background - target)
-        errors = _mean_square(image.detach() - target), self._background_errors[name]
+            self._background_errors[name] = _mean_square(self._background - target, valid)
+        errors = _mean_square(image.detach() - target, valid), self._background_errors[name]
         olds = self._recent_error, self._background_error
         self._recent_error, self._background_error = (
             error if math.isnan(old) else 0.95 * old + 0.05 * error for old, error in zip(olds, errors)
@@ -389,8 +389,8 @@ class Reconstructor:
             self._exposures.optimize()
 
 
-def _mean_square(difference: Tensor) -> float:
-    values = difference.flatten()
+def _mean_square(difference: Tensor, valid: Tensor | None) -> float:
+    values = (difference if valid is None else difference[valid]).flatten()
     return float(values.dot(values)) / len(values)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import logging
 import sys
 from dataclasses import dataclass
 
@@ -20,6 +21,8 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering.results import Projection, Rendering
 from lexsplat.runtime.errors import BackendError
+
+log = logging.getLogger("lexsplat")
 
 TILE = 16
 CHANNELS = 32
@@ -70,7 +73,8 @@ def require_gsplat() -> None:
         with contextlib.redirect_stdout(sys.stderr) if first else contextlib.nullcontext():
             from gsplat.cuda._backend import _C
     except Exception as error:  # a compiler can fail in any way
-        _C, found = None, f"{type(error).__name__} {error}"[:200]
+        log.debug("gsplat: its CUDA extension: %s", error, exc_info=error)
+        _C, found = None, f"{type(error).__name__} {_cause(str(error))}"
     if _C is None:
         raise BackendError(
             "gsplat",
@@ -79,6 +83,12 @@ def require_gsplat() -> None:
             remedy="install a wheel built for this torch and CUDA, or put nvcc and a C++ compiler on the PATH, or "
             "rasterize on the CPU: --device cpu --encoder-device cuda",
         )
+
+
+def _cause(output: str) -> str:
+    """What a compiler says at last: the last lines with an error, else the last lines."""
+    lines = [line.strip()[:160] for line in output.splitlines() if line.strip()]
+    return "; ".join([line for line in lines if "error" in line.lower()][-3:] or lines[-3:])
 
 
 def _matrix(matrix: NDArray[np.float64], device: torch.device) -> Tensor:

@@ -80,6 +80,21 @@ def require_writable(folder: Path) -> None:
         raise
 
 
+def free_bytes(folder: Path) -> int:
+    """Bytes that a new file in a folder may have: of its disk, and of the limit of file sizes, if there is one.
+
+    Args:
+        folder: It, or a part of what is above it, exists.
+    """
+    free = shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return free
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return free if limit == resource.RLIM_INFINITY else min(free, limit)
+
+
 def link_or_copy(source: Path, target: Path) -> None:
     """A second name of a file; a copy on another file system, or one without hard links."""
     try:

@@ -5,18 +5,22 @@
 - content (`file_hash`): results that are recorded, or cached for other folders and machines;
 - name, size and modification time (`file_stamp`): intermediate files of one machine, where a pass over all photos
   would cost too much;
-- name and size: the photos of a finished "poses" stage, which users copy and sync without keeping times.
+- name, size and both ends (`file_sample`): the photos of a finished "poses" stage, which users copy and sync without
+  keeping times.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from lexsplat.runtime.files import to_json
+
+_SAMPLE = 1 << 16
 
 
 def digest(contents: Iterable[bytes], size: int = 12) -> str:
@@ -42,6 +46,20 @@ def file_stamp(path: Path) -> tuple[int, int]:
 def file_hash(path: Path, digest_size: int = 12) -> str:
     """Hash of a file's content, ``2 * digest_size`` hex digits."""
     return digest(blocks(path), digest_size)
+
+
+def file_sample(path: Path) -> str:
+    """Hash of the size of a file, its first and its last 64 KiB: cheap, and the same for copies.
+
+    Photos and videos are compressed: another content of the same size differs there, too.
+    """
+    with open(path, "rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        parts = [str(size).encode()]
+        for place in (0, max(size - _SAMPLE, 0)):
+            file.seek(place)
+            parts.append(file.read(_SAMPLE))
+    return digest(parts)
 
 
 def blocks(path: Path) -> Iterator[bytes]:

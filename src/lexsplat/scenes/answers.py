@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lexsplat.captures import stem_of
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.grammar import understand, undetermined
 from lexsplat.queries.heatmaps import overlay_heatmap
@@ -81,7 +82,9 @@ class Answers:
         if not self.words:
             return self._selection(index)
         word, present = self.words[index], self.presences[index]
-        made = word.selection = word.selection or self._selection(index)
+        if word.selection is None:  # an empty one is kept as well
+            word.selection = self._selection(index)
+        made = word.selection
         return made if made.present == present else made.described(present=present)
 
     def note(self, index: int) -> str:
@@ -280,9 +283,7 @@ def _write_images(
         return answer
     from PIL import Image
 
-    stem = folder / Path(name).with_suffix("")
-    heatmap_path = stem.with_name(stem.name + ".png")
-    mask_path = stem.with_name(stem.name + ".mask.png")
+    heatmap_path, mask_path = (folder / f"{stem_of(name)}{ending}" for ending in (".png", ".mask.png"))
     for path, pixels in (
         (heatmap_path, overlay_heatmap(image, relevancy)),
         (mask_path, mask.astype(np.uint8) * 255),

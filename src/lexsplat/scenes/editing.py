@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
+from lexsplat.geometry.rotations import rotation_about
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.segments import Segments
 from lexsplat.queries.selection import Selection
@@ -32,7 +33,7 @@ from lexsplat.scenes.filling import Fill, fill_for
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.gone import gone_nouns
-from lexsplat.scenes.journal import Journal, Kind, Step, packed, unpacked
+from lexsplat.scenes.journal import CHANGES, Journal, Kind, Step, packed, unpacked
 from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.transforms import transformed
@@ -42,6 +43,8 @@ _BRIGHT = 0.9
 """Quantile of the shading from which on a recolored thing may turn pale."""
 MAX_GROWTH = 16
 """Largest number of Gaussians after edits, as a multiple of the original: copies of copies would fill the memory."""
+FEWEST = 2
+"""Smallest number of Gaussians after an edit; pages draw no fewer."""
 
 
 def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Gaussians, LanguageField]:
@@ -143,19 +146,24 @@ class Motion:
         translation: ``[3]``, world units. t is this and what keeps the bottom of the box at its height.
         rotation: R ``[3, 3]``, a proper rotation; None is the identity.
         scale: Factor on sizes, positive.
+        turn: Degrees about the up direction, counterclockwise from above, after the rotation.
     """
 
     translation: Sequence[float] = (0.0, 0.0, 0.0)
     rotation: NDArray[np.float64] | None = None
     scale: float = 1.0
+    turn: float = 0.0
 
     def values(self, chosen: Selection) -> dict[str, Any]:
         """The numbers of a `Step` that moves ``chosen``."""
         center, lift = np.zeros(3), np.zeros(3)
         if chosen:
             center, lift = chosen.center, (self.scale - 1) * chosen.box.half_sizes[2] * chosen.up.direction
+        rotation = np.eye(3) if self.rotation is None else self.rotation
+        if self.turn:
+            rotation = rotation_about(chosen.up.direction, self.turn) @ rotation
         vectors = {
-            "rotation": np.eye(3) if self.rotation is None else self.rotation,
+            "rotation": rotation,
             "translation": np.asarray(self.translation, float) + lift,
             "center": center,
         }
@@ -207,6 +215,39 @@ class Editor:
                 self._replay()
 
     # -- steps
+
+    def change(
+        self,
+        action: str,
+        chosen: Selection,
+        motion: Motion = Motion(),
+        color: Sequence[float] = (),
+        strength: float = 1.0,
+        fill: bool = True,
+    ) -> None:
+        """Do one of `CHANGES` by its name, as `delete`, `keep`, `recolor`, `move` or `duplicate` with these values.
+
+        Raises:
+            QueryError: If there is no such action, nothing is selected, or the values have no meaning for the
+                selection.
+        """
+        try:
+            if action == "delete":
+                self.delete(chosen, fill)
+            elif action == "keep":
+                self.keep(chosen)
+            elif action == "recolor":
+                self.recolor(chosen, color, strength)
+            elif action == "move":
+                self.move(chosen, motion, fill)
+            elif action == "duplicate":
+                self.duplicate(chosen, motion)
+            else:
+                raise QueryError("action", expected=", ".join(CHANGES), found=action[:40])
+        except ValueError as error:  # values that are only invalid together or for these Gaussians
+            raise QueryError(
+                action, expected="Gaussians that can be drawn after the edit", found=str(error)
+            ) from error
 
     def delete(self, chosen: Selection, fill: bool = True) -> None:
         """Remove a selection.
@@ -343,6 +384,13 @@ class Editor:
         with self._change(step.to_json()):
             self._advance(step)
             self.undone.clear()
+            if (left := len(self.scene.gaussians)) < FEWEST:
+                raise QueryError(
+                    kind,
+                    expected=f"at least {FEWEST} Gaussians after the edit",
+                    found=str(left),
+                    remedy="select less" if kind == "delete" else "select more",
+                )
 
     @contextmanager
     def _change(self, entry: dict[str, Any]) -> Iterator[None]:

@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from lexsplat.captures import stem_of
 from lexsplat.geometry.cameras import Camera
 from lexsplat.language.fields import LanguageField
 from lexsplat.runtime.files import atomic_path, write_tensors
@@ -88,8 +89,9 @@ def write_features(scene: Scene, views: Sequence[str], folder: Path) -> dict[str
     """
     written, colors = {}, code_colors(scene.field)
     for name in views:
-        stem = folder / "features" / Path(name).with_suffix("")
-        stored, picture = (stem.with_name(stem.name + ending) for ending in (".safetensors", ".png"))
+        stored, picture = (
+            folder / "features" / f"{stem_of(name)}{ending}" for ending in (".safetensors", ".png")
+        )
         write_tensors(
             stored, {"features": feature_map(scene, name).half().cpu().contiguous()}, {"view": name}
         )

@@ -28,6 +28,7 @@ import numpy as np
 
 from lexsplat.captures.images.undistortion import MAX_SIDE
 from lexsplat.captures.readers.camera_files import MAX_COORDINATE, checked_name
+from lexsplat.captures.splits import match_stem
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
@@ -51,7 +52,7 @@ class StoredView:
 
 
 def view_named(views: Mapping[str, StoredView], name: str) -> StoredView:
-    """The view called ``name``, with or without its suffix.
+    """The view called ``name``, with or without its folder and its suffix.
 
     Raises:
         QueryError: If there is none, or several match.
@@ -59,9 +60,7 @@ def view_named(views: Mapping[str, StoredView], name: str) -> StoredView:
     if not isinstance(name, str):
         expected = "the name of a view, a StoredView or a Camera"
         raise QueryError("view", expected=expected, found=repr(name)[:60])
-    if name in views:
-        return views[name]
-    matches = [view for key, view in views.items() if Path(key).stem == Path(name).stem]
+    matches = match_stem(name, views)
     if len(matches) != 1:
         known = ", ".join(list(views)[:5])
         raise QueryError(
@@ -70,7 +69,7 @@ def view_named(views: Mapping[str, StoredView], name: str) -> StoredView:
             found="no match" if not matches else f"{len(matches)} matches",
             remedy=f"the scene has {len(views)} views, such as {known}",
         )
-    return matches[0]
+    return views[matches[0]]
 
 
 def _stored_view(entry: Any, path: Path) -> StoredView:

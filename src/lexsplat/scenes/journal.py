@@ -10,7 +10,7 @@ import os
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -22,6 +22,8 @@ from lexsplat.scenes.filling import Fill
 from lexsplat.scenes.scene import Scene
 
 Kind = Literal["delete", "keep", "recolor", "move", "duplicate"]
+CHANGES: tuple[Kind, ...] = get_args(Kind)
+"""The kinds of steps."""
 JOURNAL_VERSION = 1
 _DEFLATE = 1032
 """Largest compression ratio of DEFLATE."""
@@ -129,7 +131,8 @@ class Journal:
 
     def __init__(self, path: Path, scene: Scene) -> None:
         self.path, self._scene = path, scene
-        self._size = 0
+        self._size = self._whole = 0
+        """Bytes of the file, and of its complete lines."""
 
     def append(self, entry: dict[str, Any]) -> None:
         """Append a line and wait until it is on the disk, so that a later crash does not lose it.
@@ -139,20 +142,23 @@ class Journal:
             SceneFolderError: If another program has changed the file since it was read.
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        lines = [entry] if self._size else [self._header(), entry]
-        with naming(self.path), open(self.path, "a", encoding="utf-8") as file:
+        lines = [entry] if self._whole else [self._header(), entry]
+        content = "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines).encode()
+        # Without a buffer: what a full disk refuses must not be written again when the file is closed.
+        with naming(self.path), open(self.path, "ab", buffering=0) as file:
             _lock(file)
             before = os.fstat(file.fileno()).st_size
             try:
                 self.check_unchanged()
-                file.write("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
-                file.flush()
+                before = self._size = file.truncate(self._whole)  # ends a last line that is cut off
+                rest = memoryview(content)
+                while rest:
+                    rest = rest[file.write(rest) :]
                 os.fsync(file.fileno())
-                self._size = os.fstat(file.fileno()).st_size
-            except (OSError, SceneFolderError):
-                if before:
-                    os.truncate(self.path, before)
-                else:
+                self._size = self._whole = before + len(content)
+            except BaseException:
+                file.truncate(before)
+                if not before:
                     self.path.unlink(missing_ok=True)
                 raise
 
@@ -215,11 +221,9 @@ class Journal:
             raise FileFormatError(
                 self.path, expected="a readable journal", found=str(error), remedy="discard the edit"
             ) from error
+        self._size, self._whole = len(content), content.rfind(b"\n") + 1
         if lines[-1]:
             logging.getLogger("lexsplat").warning("%s: the last line is cut off and ignored", self.path)
-            content = "\n".join([*lines[:-1], ""]).encode()
-            self.path.write_bytes(content)
-        self._size = len(content)
         return lines[:-1]
 
     def _header(self) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from lexsplat.queries.vocabulary import STUFF, default_vocabulary
 from lexsplat.runtime.errors import FileFormatError, LexsplatError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import digest
-from lexsplat.runtime.progress import Listener
+from lexsplat.runtime.progress import NOTE, Listener
 from lexsplat.scenes.folder import SceneFolder
 
 if TYPE_CHECKING:
@@ -98,7 +98,10 @@ def keep(scene: Scene) -> None:
                 scene, KeptObjects(scene.objects, classifier.places), path.with_name("objects.safetensors")
             )
         scene.write_texts()
-    except (OSError, LexsplatError) as error:
+    except OSError as error:  # such as a full disk
+        why = error.strerror or str(error)
+        log.log(NOTE, "%s: what the first questions need is not kept; they compute it (%s)", path.parent, why)
+    except LexsplatError as error:
         # Nothing is lost: questions compute it, and report a missing encoder.
         log.debug("%s: not kept (%s)", path, str(error)[:200])
 

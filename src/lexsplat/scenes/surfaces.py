@@ -95,7 +95,8 @@ def surface_below(own: FloatArray, others: FloatArray, up: FloatArray) -> Surfac
 def _fitted_plane(points: FloatArray, up: FloatArray, level: float) -> tuple[FloatArray, FloatArray] | None:
     """The plane through most points near a level, as origin and normal; None if too few lie in it."""
     heights = points @ up
-    counts = [(np.abs(heights - height) <= level).sum() for height in heights]
+    ordered = np.sort(heights)
+    counts = np.searchsorted(ordered, heights + level, "right") - np.searchsorted(ordered, heights - level)
     fits = np.abs(heights - heights[int(np.argmax(counts))]) <= level
     origin, normal = points.mean(0), up
     for _ in range(5):

@@ -10,7 +10,10 @@ from lexsplat.scenes.folder import SceneFolder, file_of
 
 
 def unsaved_steps(folder: SceneFolder) -> int:
-    """Number of steps in the journal of a scene (`lexsplat.scenes.journal`); 0 without one, or if it is damaged."""
+    """Number of steps in the journal of a scene (`lexsplat.scenes.journal`), up to a damaged line.
+
+    0 without a journal, and if it is no text.
+    """
     count = 0
     with contextlib.suppress(OSError, ValueError, AttributeError, RecursionError):
         lines = file_of(folder, "edits.jsonl").read_text(encoding="utf-8").split("\n")

@@ -16,7 +16,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lexsplat.geometry.rotations import rotation_about
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.phrases import Thing
 from lexsplat.queries.picking import Hit, surface_at
@@ -27,6 +26,7 @@ from lexsplat.scenes.answers import file_name
 from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.exporting import export_scene
 from lexsplat.scenes.folder import file_of
+from lexsplat.scenes.journal import CHANGES
 from lexsplat.scenes.publishing.manifest import MOST_OBJECTS, checksums, object_entries, scene_manifest
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.vocabulary import NAME, page_phrases, words_file
@@ -37,7 +37,6 @@ from lexsplat.viewer.history import History
 from lexsplat.viewer.requests import Asked, number, vector
 
 EXPORT_ENDINGS = (".ply", ".glb", ".splat", ".spz", ".sog", ".points.ply")
-CHANGES = ("delete", "keep", "recolor", "move", "duplicate")
 _MOST_INSTANCES = 254
 _NAMES = 6
 """Number of names that a click gets, at most."""
@@ -244,11 +243,11 @@ class Session:
             else:
                 chosen = self._chosen(asked)
                 named = chosen.described(phrase=self._name(asked)) if asked.prompt else chosen
-                self._change(action, named, values)
-        except ValueError as error:  # numbers that have no meaning for these Gaussians
-            raise QueryError(
-                action, expected="Gaussians that can be drawn after the edit", found=str(error)
-            ) from error
+                motion = Motion(
+                    vector(values, "by"), scale=number(values, "scale", 1.0), turn=number(values, "turn", 0.0)
+                )
+                color, strength = vector(values, "color"), number(values, "strength", 1.0)
+                self.editor.change(action, named, motion, color, strength)
         except OSError as error:
             raise SceneFolderError(
                 error.filename
@@ -305,19 +304,6 @@ class Session:
         mask = self.editor.planned_mask(action, self._chosen(asked)).cpu()  # type: ignore[arg-type]
         drawn = mask[self.content.drawn].to(torch.uint8).numpy()
         return struct.pack("<I", int(mask.sum())) + drawn.tobytes()
-
-    def _change(self, action: str, chosen: Selection, values: Mapping[str, Any]) -> None:
-        left = {"delete": len(chosen.mask) - len(chosen), "keep": len(chosen)}.get(action, len(chosen.mask))
-        if left < 2:
-            raise QueryError(action, expected="at least 2 Gaussians after the edit", found=str(left))
-        if action == "recolor":
-            self.editor.recolor(chosen, vector(values, "color"), number(values, "strength", 1.0))
-        elif action in ("move", "duplicate"):
-            turn = rotation_about(chosen.up.direction, number(values, "turn", 0.0))
-            motion = Motion(vector(values, "by"), turn, number(values, "scale", 1.0))
-            getattr(self.editor, action)(chosen, motion)
-        else:
-            getattr(self.editor, action)(chosen)
 
     # -- content
 

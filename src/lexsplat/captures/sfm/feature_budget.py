@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lexsplat.runtime import memory as budget
+from lexsplat.runtime.errors import CaptureError
+from lexsplat.runtime.files import free_bytes
 
 if TYPE_CHECKING:
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
@@ -21,6 +23,10 @@ HELD_AT_MOST = 1225
 """Most photos whose features are held at once: pycolmap's own limit."""
 
 _STAGE = "structure from motion"
+_STORED_BYTES = 152
+"""Bytes of a feature in the database: 128 of its descriptor, and six numbers of its keypoint."""
+_PIXELS_OF_A_FEATURE = 64
+"""Pixels for each feature, at least; photos of 320 to 1,600 pixels were found to have 60 to 160."""
 
 
 def extraction_threads(
@@ -41,6 +47,32 @@ def extraction_threads(
     remedy = "scale the photos down first" if fitting is None else f"a max-side of {fitting}"
     budget.require(_STAGE, need[1], memory, f"features of photos of {photo[0]}x{photo[1]} pixels", remedy)
     return budget.most_within(memory, need)
+
+
+def check_space(database: Path, photos: int, size: tuple[int, int], max_side: int, max_features: int) -> None:
+    """Refuse a disk without room for the features: pycolmap ends the process where it cannot write.
+
+    Args:
+        database: pycolmap's database; what an earlier run has written counts.
+        photos: Number of photos.
+        size: Width and height of the largest photo.
+        max_side: Longest side to which photos are reduced first.
+        max_features: Maximum number of features per photo.
+
+    Raises:
+        CaptureError: If there is too little free space.
+    """
+    pixels = size[0] * size[1] * min(1.0, max_side / max(size)) ** 2
+    written = database.stat().st_size if database.exists() else 0
+    need = int(photos * min(max_features, pixels / _PIXELS_OF_A_FEATURE) * _STORED_BYTES) - written
+    free = free_bytes(database.parent)
+    if free < need:
+        raise CaptureError(
+            database.parent,
+            expected=f"{need / 1e6:,.1f} MB of free space for the features of {photos:,} photos",
+            found=f"{free / 1e6:,.1f} MB",
+            remedy="free some space there and run the same command again, or give a smaller max-features",
+        )
 
 
 def matching_plan(

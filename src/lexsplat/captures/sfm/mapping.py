@@ -16,7 +16,7 @@ from PIL import Image
 
 from lexsplat.captures.images.reading import image_size
 from lexsplat.captures.sfm.counting import counted_pairs
-from lexsplat.captures.sfm.feature_budget import extraction_threads, matching_plan
+from lexsplat.captures.sfm.feature_budget import check_space, extraction_threads, matching_plan
 from lexsplat.captures.sfm.pose_agreement import misregistered, register_again
 from lexsplat.captures.sfm.pycolmap_import import pycolmap
 from lexsplat.runtime import memory as budget
@@ -104,7 +104,12 @@ def extract_features(
         memory: Bytes of host memory available.
         listener: Receives the number of finished photos.
         camera_model: Model of the lenses.
+
+    Raises:
+        CaptureError: If the disk has too little free space.
+        MemoryBudgetError: If ``memory`` is too little for photos of this size.
     """
+    check_space(database, len(photos.names), photos.largest, config.max_side, config.max_features)
     pycolmap.Database.open(database).close()
     reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
     if photos.masks is not None:

@@ -144,7 +144,8 @@ def poses_from_photos(
             which cannot be counted. The time of features and matching is logged after their first units.
 
     Raises:
-        CaptureError: If there are fewer than three photos, one is unreadable, or none can be registered.
+        CaptureError: If there are fewer than three photos, one is unreadable, none can be registered, or the disk has
+            too little free space.
         BackendError: If the global mapper is requested and this pycolmap has none.
         MemoryBudgetError: If ``memory`` is too little for photos of this size and number.
     """

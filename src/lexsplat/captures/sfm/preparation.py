@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from lexsplat.captures.capture import stem_of
 from lexsplat.captures.images.masks import IGNORE_FOLDER, find_ignore_masks
 from lexsplat.captures.images.reading import (
     IMAGE_SUFFIXES,
@@ -209,9 +210,9 @@ def _some(names: Sequence[str]) -> str:
 
 def _twins(names: Sequence[str]) -> list[str]:
     """A note on photos that differ in their endings only, as phones export a photo in two formats."""
-    groups: dict[Path, list[str]] = {}
+    groups: dict[str, list[str]] = {}
     for name in names:
-        groups.setdefault(Path(name).with_suffix(""), []).append(name)
+        groups.setdefault(stem_of(name), []).append(name)
     twins = [group for group in groups.values() if len(group) > 1]
     if not twins:
         return []
@@ -317,8 +318,7 @@ def _new_names(photos: Sequence[_Photo]) -> dict[str, str]:
             names[photo.name] = photo.name
             continue
         suffix = ".jpg" if photo.lossy else ".png"
-        stem = Path(photo.name).with_suffix("").as_posix()
-        name = photo.name if photo.name.endswith(suffix) else f"{stem}{suffix}"
+        name = photo.name if photo.name.endswith(suffix) else f"{stem_of(photo.name)}{suffix}"
         while name in kept:
             name = f"{photo.name}{suffix}" if name != f"{photo.name}{suffix}" else f"_{name}"
         kept.add(name)

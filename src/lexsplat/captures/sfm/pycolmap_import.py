@@ -37,7 +37,11 @@ __all__ = ["pycolmap", "quiet_pycolmap"]
 
 @contextmanager
 def quiet_pycolmap(seed: int) -> Iterator[None]:
-    """pycolmap with a fixed seed and without its log; failures are raised as typed errors."""
+    """pycolmap with a fixed seed and without its log.
+
+    Its failures are raised as they are. One that it holds to be impossible ends the process with a stack trace: so
+    does a disk that fills up while it writes, in spite of `lexsplat.captures.sfm.feature_budget.check_space`.
+    """
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)
     pycolmap.set_random_seed(seed)

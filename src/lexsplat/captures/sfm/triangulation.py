@@ -120,7 +120,7 @@ def triangulate(
         Points ``[P, 3]`` float32, world, and their colors ``[P, 3]`` float32 in 0..1; P may be 0.
 
     Raises:
-        CaptureError: If an image cannot be read.
+        CaptureError: If an image cannot be read, or the disk has too little free space.
     """
     views = capture.train_views
     empty = np.zeros((0, 3), np.float32)

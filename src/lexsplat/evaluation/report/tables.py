@@ -44,6 +44,9 @@ _MEASURED_ONCE = {
 }  # fmt: skip
 """Columns whose differences may be noise of the machine: no value of them is marked as best."""
 
+_CAMERA_STAGES = ("poses", "views")
+"""Stages that make cameras: no column counts their time."""
+
 REFERENCE_ROWS = frozenset({"nearest"})
 """Rows that are shown but never marked as best: they use the evaluated photo itself."""
 
@@ -155,6 +158,7 @@ def _numbers(result: Mapping[str, Any]) -> dict[str, float | None]:
     for protocol in ("official", "lerf_2d", "lerf_3d"):
         numbers |= {f"{protocol}_{name}": v for name, v in (language.get(protocol) or {}).items()}
     seconds = speed.get("stage_seconds") or {}
+    seconds = {stage: value for stage, value in seconds.items() if stage not in _CAMERA_STAGES}
     language_stages = [value for stage, value in seconds.items() if stage not in ("reconstruct", "features")]
     return numbers | {
         "fps": speed.get("render_fps"),

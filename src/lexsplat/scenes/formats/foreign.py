@@ -27,7 +27,7 @@ from lexsplat.captures.readers.camera_files import MAX_COORDINATE
 from lexsplat.geometry.gaussians import LARGEST, Gaussians
 from lexsplat.runtime.errors import FileFormatError
 
-logger = logging.getLogger(__name__)
+logger = logging.getLogger("lexsplat")
 
 MOST_DROPPED = 0.1
 """Share of invalid Gaussians above which a file counts as damaged."""

@@ -39,7 +39,7 @@ from lexsplat.scenes.formats.foreign import (
 )
 from lexsplat.scenes.transforms import transformed
 
-logger = logging.getLogger(__name__)
+logger = logging.getLogger("lexsplat")
 
 HALF_TURN = np.diag([1.0, -1.0, -1.0])
 """Rotation between the axes of SPZ and those of a PLY."""

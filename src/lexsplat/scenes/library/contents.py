@@ -253,9 +253,9 @@ def _neighbors(scene: Scene, segments: Segments) -> dict[str, Tensor]:
     count, labels = segments.levels.shape[1], segments.labels.numpy()
     opacities = scene.gaussians.opacities.detach().cpu().double().numpy()
     seen = ~scene.hidden.cpu().numpy()
-    # Hidden Gaussians link a lamp and its foot; those of fills link nothing.
     firm = np.flatnonzero(opacities >= _FAINT)  # hidden Gaussians link a lamp and its foot
-    added = scene.field.segments.added if scene.field.segments else None  # denser than what photos show
+    # Fills link as well, but do not count for the spacings: they are denser than what photos show.
+    added = scene.field.segments.added if scene.field.segments else None
     means, of = scene.gaussians.means.detach().cpu().double().numpy()[firm], labels[firm]
     spacings, pairs, gaps = np.zeros(count), np.zeros((0, 2), np.int64), np.zeros(0)
     if len(firm) > 1:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import re
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,16 +23,10 @@ from lexsplat.runtime.errors import FileFormatError, LexsplatError, LibraryError
 from lexsplat.runtime.files import locked
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.library import identity
 from lexsplat.scenes.library.contents import Contents, map_contents
 from lexsplat.scenes.library.entries import Codes, map_codes, record_of, write_entry
 from lexsplat.scenes.library.found import Found
-from lexsplat.scenes.library.identity import (
-    in_use,
-    library_name,
-    listed_records,
-    make_library,
-    telling_errors,
-)
 from lexsplat.scenes.library.mending import mended, problems_of
 from lexsplat.scenes.library.records import (
     BUNDLED,
@@ -76,7 +70,7 @@ class Library:
         self.root, self._device = Path(root), choose_device(device)
         self.stage = self.root / "scenes"
         """The folder of the entries."""
-        name = library_name(self.root)
+        name = identity.library_name(self.root)
         self.server = Server(index, name, self.root) if index else None
         self._home, self._texts = self.root.resolve(), TextCache(self.root / "texts")
         self.listener: Listener = silent  # receives progress events of reading, adding and verifying scenes
@@ -86,8 +80,8 @@ class Library:
         self._states: dict[str, tuple[str, str]] = {}
         self._scenes: Bounded[tuple[str, str, str], Scene] = Bounded(_OPEN_SCENES)
         self._contents: Bounded[str, Contents] = Bounded(_KEPT_CONTENTS)
-        self.damaged: dict[str, FileFormatError] = {}
-        """Scenes whose record or codes cannot be read, by name."""
+        self._bad_records: dict[str, FileFormatError] = {}
+        self._bad_codes: dict[str, tuple[tuple[int, int], FileFormatError]] = {}  # of which record
 
     @classmethod
     def create(cls, root: str | Path, device: str = "auto", index: str | None = None) -> Library:
@@ -96,8 +90,8 @@ class Library:
         Raises:
             LibraryError: If the folder has files of another program.
         """
-        with telling_errors(Path(root)):
-            make_library(Path(root))
+        with identity.telling_errors(Path(root)):
+            identity.make_library(Path(root))
         return cls(root, device, index)
 
     def __repr__(self) -> str:
@@ -114,7 +108,13 @@ class Library:
         Raises:
             LibraryError: If the library was moved or deleted since it was opened.
         """
-        return [entry.name[:-5] for entry in listed_records(self.root, new=not self._records)]
+        return [entry.name[:-5] for entry in identity.listed_records(self.root, new=not self._records)]
+
+    @property
+    def damaged(self) -> dict[str, FileFormatError]:
+        """Scenes whose record or codes cannot be read, by name."""
+        codes = {n: e for n, (of, e) in self._bad_codes.copy().items() if self._records[n][0] == of}
+        return {**codes, **self._bad_records}
 
     def record(self, name: str) -> Record | None:
         """The record of a scene; None if it cannot be read (`damaged`)."""
@@ -127,18 +127,17 @@ class Library:
             known = self._records.get(name)
             if known is None or known[0] != stamp:
                 known = self._records[name] = (stamp, read_record(Path(path)))
-            self.damaged.pop(name, None)
+            self._bad_records.pop(name, None)
             return known[1]
         except FileNotFoundError:  # removed in the meantime
-            self.damaged.pop(name, None)
-            return None
+            self._bad_records.pop(name, None)
         except FileFormatError as error:
-            self.damaged[name] = error
-            return None
+            self._bad_records[name] = error
+        return None
 
     def records(self) -> list[Record]:
         """The records of all scenes that can be read; raises as `names`."""
-        listed = listed_records(self.root, new=not self._records)
+        listed = identity.listed_records(self.root, new=not self._records)
         records = (self._record(each.name[:-5], each) for each in listed)
         return [record for record in records if record is not None]
 
@@ -157,9 +156,10 @@ class Library:
                 now = self.record(record.name)
                 if now is None or now.content != record.content:  # replaced or removed in the meantime
                     return None if now is None else self.codes(now, by_hash)
-                self.damaged[record.name] = error
+                self._bad_codes[record.name] = (self._records[record.name][0], error)
                 return None
             self._codes[record.name] = known
+            self._bad_codes.pop(record.name, None)
         return known[1]
 
     def contents(self, record: Record) -> Contents:
@@ -229,7 +229,7 @@ class Library:
         found = read_scene(path, self._device)
         clip = found.encoder()
         known = found.folder.record["stages"].get("features", {}).get("clip_hash", "")
-        encode = functools.partial(self.encode, known, clip)
+        encode = partial(self.encode, known, clip)
         content = (found.gaussians, found.field, found.views, clip, found.query, found.folder)
         return Scene(*content, encode_text=encode)
 
@@ -261,7 +261,7 @@ class Library:
 
     def embed(self, content_hash: str, clip: str, texts: list[str]) -> Tensor:
         """Unit embeddings ``[T, D]`` of prompts, as `Scene.embed` of the scenes with this encoder."""
-        return embed_prompts(texts, functools.partial(self.encode, content_hash, clip))
+        return embed_prompts(texts, partial(self.encode, content_hash, clip))
 
     # -- changing it
 
@@ -273,7 +273,7 @@ class Library:
             LibraryError: If another process changes it, nothing can be written, or it was moved or deleted.
         """
         self.names()
-        with telling_errors(self.root), locked(self.root, lambda holder: in_use(self.root, holder)):
+        with identity.telling_errors(self.root), locked(self.root, partial(identity.in_use, self.root)):
             self._sweep()
             # Asked before anything is changed: whether the server holds what the library holds.
             self._served = self.server is None or self.server.is_current(self.stage, self.groups())

@@ -1,0 +1,44 @@
+"""The plane that a thing stands on, among points of which most lie in a known one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lexsplat.scenes import surfaces
+from lexsplat.scenes.surfaces import surface_below
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def table_and_thing(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """A thing on a table at height 0.5 with a slope of 1 in 50, and a lamp above a part of the table."""
+    random = np.random.default_rng(count)
+    thing = random.uniform((-0.2, -0.2, 0.5), (0.2, 0.2, 0.9), (200, 3))
+    table = random.uniform(-0.5, 0.5, (count, 3))
+    table[:, 2] = 0.5 + 0.02 * table[:, 0] + random.normal(0, 0.002, count)
+    lamp = random.uniform((-0.5, -0.5, 0.55), (0.5, 0.5, 0.6), (count // 3, 3))
+    return thing, np.concatenate([lamp, table])
+
+
+def test_the_plane_under_a_thing_is_that_of_most_points_around_its_foot():
+    found = surface_below(*table_and_thing(600), UP)
+    normal = np.array([-0.02, 0, 1]) / np.hypot(0.02, 1)
+    assert found.axes[2] == pytest.approx(normal, abs=5e-3)
+    height = found.origin[2] - 0.02 * found.origin[0]
+    assert height == pytest.approx(0.5, abs=1e-3)
+
+
+def test_the_plane_of_many_points_takes_no_more_passes_over_them(monkeypatch):
+    """A pass for each point took seconds where a thing stands on a large and dense floor."""
+    passes, absolute = [], np.abs
+
+    def counted(values, *rest):
+        passes.append(len(values))
+        return absolute(values, *rest)
+
+    monkeypatch.setattr(surfaces.np, "abs", counted)
+    for count in (200, 2_000):
+        passes.clear()
+        assert surface_below(*table_and_thing(count), UP) is not None
+        assert len(passes) < 20
