@@ -1,7 +1,9 @@
 """What is refused at start, in writing, and where the protocol has no place for an answer."""
 
 import errno
+import threading
 
+import anyio
 import pytest
 
 pytest.importorskip("mcp")
@@ -72,6 +74,34 @@ def test_an_output_that_becomes_a_file_ends_in_one_structured_error(scenes, tmp_
     assert reply.is_error
     assert str(tmp_path / "output") in reply.structured_content["error"]["subject"]
     assert "report" not in text
+
+
+@pytest.mark.parametrize("tool", ["export", "edit"])
+def test_a_call_that_the_client_cancels_writes_nothing(scenes, tmp_path, monkeypatch, tool):
+    writes = {"export": (writing, "export_scene"), "edit": (Editor, "save")}[tool]
+    given = {"export": {"file": "mug.ply"}, "edit": {"action": "keep", "folder": "mug"}}[tool]
+    write, begun, left = getattr(*writes), threading.Event(), threading.Event()
+
+    def slow(*arguments, **options):
+        begun.set()
+        assert left.wait(60)
+        return write(*arguments, **options)
+
+    monkeypatch.setattr(*writes, slow)
+
+    async def dialogue(client):
+        async with anyio.create_task_group() as calls:
+            calls.start_soon(client.call_tool, tool, {"phrase": "mug", **given})
+            await anyio.to_thread.run_sync(begun.wait, 60)
+            calls.cancel_scope.cancel()
+            left.set()
+
+    server = make_server(scenes, tmp_path / "output")
+    talk(server, dialogue)  # in process it ends with the call
+    assert begun.is_set()
+    assert not list((tmp_path / "output").iterdir())
+    named = ask(server, "list_scenes")[0].structured_content["scenes"]
+    assert [scene["name"] for scene in named] == ["demo"]
 
 
 @pytest.mark.parametrize("name", [" ", "   ", "\t", " mug", "mug "])

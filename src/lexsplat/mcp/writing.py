@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from collections.abc import Iterator, MutableMapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+from anyio import from_thread
 from pydantic import Field
 
 from lexsplat.mcp import answers
@@ -155,10 +157,19 @@ def check_output(output: Path) -> None:
 
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Make the folder of a new file; errors of the disk in the block get a remedy."""
+    """Make the folder of a new file or folder; errors of the disk in the block get a remedy.
+
+    A call that its client has cancelled writes nothing: what was written meanwhile is removed.
+    """
     try:
+        _end_if_cancelled()
         path.parent.mkdir(parents=True, exist_ok=True)
         yield
+        try:
+            _end_if_cancelled()
+        except BaseException:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+            raise
     except OSError as error:
         raise SceneFolderError(
             error.filename or path,
@@ -166,3 +177,9 @@ def _writing(path: Path) -> Iterator[None]:
             found=error.strerror or repr(error)[:80],
             remedy="make room or change its permissions, or start the server with another --output",
         ) from error
+
+
+def _end_if_cancelled() -> None:
+    """End this thread's work, with the exception of its event loop, if the client has cancelled the call."""
+    with contextlib.suppress(RuntimeError):  # called by a program, without an event loop
+        from_thread.check_cancelled()
