@@ -20,6 +20,7 @@ from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.exporting import ending_of, export_scene, exported
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.serving import OpenScene, counted, new_name, qualified, sentence, shortened
+from lexsplat.scenes.unsaved import unsaved_steps
 
 FileName = Annotated[str, Field(description='Name of a new file without a folder, such as "duck.ply".')]
 
@@ -51,7 +52,14 @@ class WritingTools(Tools):
         written, count = [str(each) for each in files], len(exported(place, path, [found])[0])
         text = f"{counted(count, 'Gaussian')} of {shortened(asked['understood'])} written to {written[0]}."
         return Reply(
-            qualified(text, asked), {**place.world.to_json(), **asked, "files": written, "gaussians": count}
+            qualified(text, asked),
+            {
+                **place.world.to_json(),
+                **asked,
+                "files": written,
+                "gaussians": count,
+                "unsaved_steps": unsaved_steps(place.folder) if place.folder else 0,
+            },
         )
 
     def edit(
