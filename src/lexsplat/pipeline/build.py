@@ -28,6 +28,7 @@ from lexsplat.pipeline.inputs import (
     check_given_maps,
     check_photos,
     prepare_capture,
+    refuse_output_in_capture,
     refuse_without_cameras,
     survey_photos,
 )
@@ -104,6 +105,8 @@ def build(
     config = replace(config, encoder_device=choose_encoder_device(config.encoder_device, device))  # type: ignore[arg-type]
     if device == "cuda":
         require_gsplat()  # before anything that takes time
+    if source is not None:
+        refuse_output_in_capture(source, Path(output))
     folder = SceneFolder(Path(output))
     folder.refuse_foreign_files()
     is_new = not folder.root.exists()
