@@ -113,6 +113,30 @@ def test_a_name_of_spaces_is_refused(scenes, tmp_path, name):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("", "which is empty"),
+        ("mug.ply ", "which has spaces at an end"),
+        ("mug\n.ply", "which has characters that cannot be printed"),
+        ("../mug.ply", "which is a path"),
+        (".ply", "which begins with a dot"),
+        ("m" * 97 + ".ply", "which has 101 characters"),
+    ],
+)
+def test_a_name_that_is_refused_is_told_what_is_wrong_with_it(scenes, tmp_path, name, told):
+    _, text = ask(make_server(scenes, tmp_path), "export", phrase="mug", file=name)
+    assert f"expected a plain name of at most 100 characters, found {name[:60]!r}, {told}" in text
+    assert 'give one such as "duck.ply"' in text
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_what_is_in_the_way_of_a_new_scene_is_called_what_it_is(scenes, tmp_path, kind):
+    (tmp_path / "mug").mkdir() if kind == "folder" else (tmp_path / "mug").touch()
+    _, text = ask(make_server(scenes, tmp_path), "edit", phrase="mug", action="keep", folder="mug")
+    assert f"expected a new name, found a {kind} that exists" in text
+
+
 @pytest.mark.parametrize("point", [[True, 0, 0], [0.5, 0, False]])
 def test_a_boolean_is_no_coordinate(server, point):
     reply, text = ask(server, "nearest", target="mug", point=point)

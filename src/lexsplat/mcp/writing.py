@@ -125,22 +125,30 @@ class WritingTools(Tools):
 
     def _new(self, argument: str, name: str) -> Path:
         path = self.output / name
-        if (
-            not name
-            or name != name.strip()
-            or Path(name).name != name
-            or name.startswith(".")
-            or not name.isprintable()
-            or len(name) > 100
-        ):
+        if wrong := _wrong_with(name):
             raise QueryError(
-                argument, expected="a plain name of at most 100 characters", found=repr(name[:60])
+                argument,
+                expected="a plain name of at most 100 characters",
+                found=f"{name[:60]!r}, {wrong}",
+                remedy=f'give one such as "duck{".ply" if argument == "file" else ""}"; --output is its folder',
             )
         if path.exists() or path.is_symlink():
-            raise SceneFolderError(
-                path, expected="a new name", found="a file that exists", remedy="give another name"
-            )
+            found = f"a {'folder' if path.is_dir() else 'file'} that exists"
+            raise SceneFolderError(path, expected="a new name", found=found, remedy="give another name")
         return path
+
+
+def _wrong_with(name: str) -> str:
+    """What keeps a text from being the name of a new file; empty if nothing does."""
+    faults = {
+        "which is empty": not name.strip(),
+        "which has spaces at an end": name != name.strip(),
+        "which has characters that cannot be printed": not name.isprintable(),
+        "which is a path": Path(name).name != name,
+        "which begins with a dot": name.startswith("."),
+        f"which has {len(name)} characters": len(name) > 100,
+    }
+    return next((fault for fault, holds in faults.items() if holds), "")
 
 
 def check_output(output: Path) -> None:
