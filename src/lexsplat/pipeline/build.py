@@ -260,6 +260,8 @@ class _Builder:
     def _run_stage(self, name: str, stage: _Stage) -> None:
         key = self.fingerprints[name] = self._fingerprint(stage)
         if self._is_finished(name, stage):
+            done = self.folder.record["stages"]
+            done[name] = done.pop(name)  # in the order of the stages, whichever ran before
             warn_again(self.folder.record["stages"][name])
             self.listener(Event(name, 1, 1, {"kept": 1.0}))
             return
