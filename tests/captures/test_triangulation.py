@@ -128,10 +128,12 @@ def test_initial_points_are_triangulated_where_possible(wall, triangulated):
     assert f"{len(triangulated[0]):,} points triangulated" in found.note
 
 
-def test_initial_points_are_random_on_a_wall_without_texture(tmp_path):
+def test_initial_points_are_random_on_a_wall_without_texture_and_a_warning_says_so(tmp_path, caplog):
     write_wall(tmp_path, np.full((256, 256, 3), [0.2, 0.4, 0.6]), count=3)
     found = initial_points(load_capture(tmp_path, test_every=0), count=500)
     assert found.origin == "random"
+    (told,) = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert found.note in told.getMessage()
     assert "500 random points" in found.note
     np.testing.assert_allclose(found.colors, np.tile([0.2, 0.4, 0.6], (500, 1)), atol=0.01)
 

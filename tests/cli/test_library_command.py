@@ -196,3 +196,15 @@ def test_wrong_usage_is_refused(capsys, arguments, told):
     assert refusal.value.code == 2
     error = " ".join(capsys.readouterr().err.replace("│", " ").split())
     assert told.lower() in error.lower()
+
+
+def test_a_library_notes_once_that_steps_of_an_edit_are_not_in_a_scene(rooms, capsys):
+    (rooms / "kitchen" / "edits.jsonl").write_text('{}\n{"kind": "recolor"}\n')
+    told = "note: 1 step of lexsplat edit is not in this scene; lexsplat edit "
+    for action, words in (("add", [rooms / "kitchen"]), ("search", ["mug", "mug"])):
+        capsys.readouterr()
+        assert cli.main(["library", action, str(rooms / "library"), *map(str, words)]) == 0
+        captured = capsys.readouterr()
+        assert captured.err.count(told) == 1, action
+        assert told not in captured.out
+    assert "lexsplat edit" not in run(capsys, "search", rooms, "candle")

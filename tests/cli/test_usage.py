@@ -111,7 +111,10 @@ def test_a_lack_of_memory_is_named_with_its_remedy(error, monkeypatch, capsys):
     ("number", "told"),
     [(errno.EACCES, "Permission denied; allow it, or give another place"),
      (errno.ENOSPC, "No space left on device; free some space and run the same command again"),
-     (errno.EEXIST, "File exists; give another place"),
+     (errno.EEXIST, "expected a folder, found a file; give another place"),
+     (errno.ENOTDIR, "expected a folder, found a file; give another place"),
+     (errno.EISDIR, "expected a file, found a folder; give another name"),
+     (errno.ENOENT, "expected a path that exists or can be made, found none; check it, or give another place"),
      (errno.EIO, "Input/output error")],
 )  # fmt: skip
 def test_an_error_of_the_system_is_one_line_with_its_remedy(number, told, monkeypatch, capsys):

@@ -1,5 +1,7 @@
 """The facts that every answer has: units, up, threshold, presence, best view, and the view of left and right."""
 
+import shutil
+
 import pytest
 
 pytest.importorskip("mcp")
@@ -8,6 +10,7 @@ from support.mcp_clients import ask, talk
 
 from lexsplat import open_scene
 from lexsplat.mcp.server import make_server
+from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.serving import open_scenes
 
 CALLS = {
@@ -81,3 +84,27 @@ def test_yes_perhaps_and_no_begin_a_sentence_that_reads_well(server):
 
 def test_one_scene_is_not_called_one_scenes():
     assert ask(make_server(open_scenes(["demo"])), "list_scenes")[1] == "1 scene: demo."
+
+
+@pytest.fixture
+def with_a_step(tmp_path):
+    """A copy of the bundled scene with a step of an edit that no scene holds."""
+    scene = shutil.copytree(BUNDLED_SCENE, tmp_path / "table")
+    (scene / "edits.jsonl").write_text('{}\n{"kind": "recolor"}\n')
+    return scene
+
+
+def test_every_answer_says_that_a_step_of_an_edit_is_not_in_the_scene(with_a_step, tmp_path):
+    server = make_server(open_scenes([str(with_a_step)]), tmp_path / "output")
+    told = f"Note: 1 step of lexsplat edit is not in this scene; lexsplat edit {with_a_step} save --output SCENE2"
+    for tool in ("find", "count", "describe_scene", "render", "export"):
+        reply, text = ask(server, tool, **CALLS.get(tool, {}))
+        assert text.count(told) == 1, tool
+        if tool not in ("count", "render"):
+            assert reply.structured_content["unsaved_steps"] == 1
+    reply, text = ask(server, "list_scenes")
+    assert text == "1 scene: table (1 unsaved step)."
+    assert reply.structured_content["scenes"][0]["unsaved_steps"] == 1
+    (with_a_step / "edits.jsonl").unlink()
+    reply, text = ask(server, "find", phrase="mug")
+    assert (reply.structured_content["unsaved_steps"], "step" in text) == (0, False)

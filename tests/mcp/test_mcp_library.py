@@ -85,6 +85,14 @@ def test_a_scene_that_cannot_be_asked_leaves_the_search_unsure(server, tmp_path)
     assert text == 'In no scene that could be asked: nothing fits "mug". 1 scene could not be asked.'
 
 
+def test_a_scene_that_was_moved_is_added_from_its_new_place(server, library, tmp_path):
+    (tmp_path / "kitchen").rename(tmp_path / "elsewhere")
+    reply, text = ask(server, "find", phrase="mug", scene="kitchen")
+    assert reply.is_error
+    assert f"if it was moved: lexsplat library add {library.root} NEW_PLACE" in text
+    assert "lexsplat build" not in text
+
+
 def test_a_library_that_is_gone_is_an_error_with_its_place_and_a_remedy(server, library):
     ask(server, "search_library", phrase="mug")
     library.root.rename(library.root.with_name("elsewhere"))

@@ -1,7 +1,9 @@
 """What is refused at start, in writing, and where the protocol has no place for an answer."""
 
 import errno
+import threading
 
+import anyio
 import pytest
 
 pytest.importorskip("mcp")
@@ -74,6 +76,34 @@ def test_an_output_that_becomes_a_file_ends_in_one_structured_error(scenes, tmp_
     assert "report" not in text
 
 
+@pytest.mark.parametrize("tool", ["export", "edit"])
+def test_a_call_that_the_client_cancels_writes_nothing(scenes, tmp_path, monkeypatch, tool):
+    writes = {"export": (writing, "export_scene"), "edit": (Editor, "save")}[tool]
+    given = {"export": {"file": "mug.ply"}, "edit": {"action": "keep", "folder": "mug"}}[tool]
+    write, begun, left = getattr(*writes), threading.Event(), threading.Event()
+
+    def slow(*arguments, **options):
+        begun.set()
+        assert left.wait(60)
+        return write(*arguments, **options)
+
+    monkeypatch.setattr(*writes, slow)
+
+    async def dialogue(client):
+        async with anyio.create_task_group() as calls:
+            calls.start_soon(client.call_tool, tool, {"phrase": "mug", **given})
+            await anyio.to_thread.run_sync(begun.wait, 60)
+            calls.cancel_scope.cancel()
+            left.set()
+
+    server = make_server(scenes, tmp_path / "output")
+    talk(server, dialogue)  # in process it ends with the call
+    assert begun.is_set()
+    assert not list((tmp_path / "output").iterdir())
+    named = ask(server, "list_scenes")[0].structured_content["scenes"]
+    assert [scene["name"] for scene in named] == ["demo"]
+
+
 @pytest.mark.parametrize("name", [" ", "   ", "\t", " mug", "mug "])
 def test_a_name_of_spaces_is_refused(scenes, tmp_path, name):
     for tool, given in (("edit", {"action": "keep", "folder": name}), ("export", {"file": name})):
@@ -81,6 +111,30 @@ def test_a_name_of_spaces_is_refused(scenes, tmp_path, name):
         assert reply.is_error
         assert "expected a plain name" in text
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("", "which is empty"),
+        ("mug.ply ", "which has spaces at an end"),
+        ("mug\n.ply", "which has characters that cannot be printed"),
+        ("../mug.ply", "which is a path"),
+        (".ply", "which begins with a dot"),
+        ("m" * 97 + ".ply", "which has 101 characters"),
+    ],
+)
+def test_a_name_that_is_refused_is_told_what_is_wrong_with_it(scenes, tmp_path, name, told):
+    _, text = ask(make_server(scenes, tmp_path), "export", phrase="mug", file=name)
+    assert f"expected a plain name of at most 100 characters, found {name[:60]!r}, {told}" in text
+    assert 'give one such as "duck.ply"' in text
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_what_is_in_the_way_of_a_new_scene_is_called_what_it_is(scenes, tmp_path, kind):
+    (tmp_path / "mug").mkdir() if kind == "folder" else (tmp_path / "mug").touch()
+    _, text = ask(make_server(scenes, tmp_path), "edit", phrase="mug", action="keep", folder="mug")
+    assert f"expected a new name, found a {kind} that exists" in text
 
 
 @pytest.mark.parametrize("point", [[True, 0, 0], [0.5, 0, False]])

@@ -238,3 +238,12 @@ def test_every_stage_receives_the_memory_budget(tiny_capture, tmp_path, monkeypa
     assert granted == dict.fromkeys(
         ("reconstruct", "fit_codebook", "averaged", "trained"), parse_bytes("900MB")
     )
+
+
+def test_the_record_lists_the_stages_in_their_order_whichever_ran_again(
+    built_by_method, tiny_capture, tmp_path
+):
+    copy = shutil.copytree(built_by_method / "averaged", tmp_path / "copy")
+    folder = build(tiny_capture, copy, replace(AVERAGED, iterations=5))
+    assert list(folder.record["stages"]) == ["reconstruct", "features", "language"]
+    assert list(SceneFolder.open(copy).record["stages"]) == ["reconstruct", "features", "language"]

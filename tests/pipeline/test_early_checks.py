@@ -53,6 +53,25 @@ def refused(
     assert not output.exists(), "nothing half-written, and no empty folder"
 
 
+@pytest.mark.parametrize(
+    ("cameras", "named"),
+    [(False, ""), (True, ""), (True, "transforms.json")],
+    ids=["photos alone", "with cameras", "file of cameras"],
+)
+@pytest.mark.parametrize("inside", ["", "images"])
+def test_a_scene_is_not_mixed_into_its_capture(photos, tiny_capture, tmp_path, cameras, named, inside):
+    capture = shutil.copytree(tiny_capture, tmp_path / "capture") if cameras else photos
+    if named:
+        (capture / named).write_text("{}")
+    before = {path: path.stat().st_mtime_ns for path in capture.rglob("*")}
+    with pytest.raises(CaptureError) as caught:
+        build(capture / named, capture / inside, CONFIG)
+    assert_reports(
+        caught.value, str(capture / inside), "an output folder of its own", "of the capture", "--output"
+    )
+    assert {path: path.stat().st_mtime_ns for path in capture.rglob("*")} == before
+
+
 def test_ground_truth_is_checked_before_structure_from_motion(photos, tmp_path):
     save(photos / "segmentations" / "2" / "wall.png", np.ones((60, 60)))
     refused(photos, tmp_path / "out", "wall.png", "80x60", "60x60")

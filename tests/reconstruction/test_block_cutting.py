@@ -210,7 +210,8 @@ def rolled(capture, folder):
     [
         (
             "200",
-            r"error: --blocks 200: expected at least 400 training views, found \d+; give a smaller --blocks, .*",
+            r"error: 200 blocks: expected at least 400 training views, found \d+; give at most --blocks \d+; "
+            r"--blocks auto takes fewer with more --memory",
         ),
         ("2", r"error: --blocks: expected a ground plane, .*; give --up X,Y,Z or --blocks none"),
     ],

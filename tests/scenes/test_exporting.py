@@ -126,6 +126,8 @@ def test_the_phrase_furthest_above_its_threshold_determines_the_label(built):
         (["x.csv", "--select", "apple", "--language"], "without room for language"),
         (["x.ply", "--select", "red apple", "blue ball", "--threshold", "1"],
          "red apple, blue ball: expected something to write, found nothing"),
+        (["x.csv", "--select", "apple", "--threshold", "1"], "apple: expected something to write, found nothing"),
+        (["x.json", "--select", "apple", "--threshold", "1"], "apple: expected something to write, found nothing"),
     ],
 )  # fmt: skip
 def test_impossible_exports_are_refused_in_one_line(built, tmp_path, arguments, words, capsys):

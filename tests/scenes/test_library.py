@@ -339,7 +339,7 @@ def test_a_scene_with_a_cut_record_is_reported_with_a_remedy(rooms_copy):
     library = Library(rooms_copy / "library")
     for told in (library.search("griffin").skipped["kitchen"], library.verify()["kitchen"]):
         assert "scene.json: expected JSON" in told
-        assert told.endswith(f"; build it again, or: lexsplat library remove {library.root} kitchen")
+        assert told.endswith(f" run the build again, or: lexsplat library remove {library.root} kitchen")
 
 
 def test_a_scene_of_another_format_version_is_reported(rooms_copy):

@@ -132,3 +132,27 @@ def test_invalid_up_and_scale_are_refused(old_demo_copy, capsys):
     assert "expected a positive distance, found 0" in capsys.readouterr().err
     assert run("scale", "demo", "--distance", 1, "--points", "1,1,1", "1,1,0") == 1
     assert "found the bundled scene" in capsys.readouterr().err
+
+
+def test_a_scale_out_of_all_bounds_is_a_mistyped_distance(old_demo_copy, capsys):
+    before = (old_demo_copy / "scene.json").read_bytes()
+    points = ["--points", "0,0,0", "1,0,0"]
+    with pytest.raises(SystemExit):
+        run("scale", old_demo_copy, "--distance", "1e300", *points)
+    said = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert "distance must be positive and at most 1e+09 m, got 1e+300" in said
+    for far, distance in (("1,0,0", "1e-30"), ("1e300,0,0", "1"), ("1e-30,0,0", "1")):
+        assert run("scale", old_demo_copy, "--distance", distance, "--points", "0,0,0", far) == 1
+        assert "scale: expected a unit of 1e-09 to 1e+09 m, found" in capsys.readouterr().err
+    assert (old_demo_copy / "scene.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("option", "given"),
+    [("up", ["--up", "0,0"]), ("points", ["--distance", "1", "--points", "0,0", "1,1,1"])],
+)
+def test_a_vector_that_is_none_is_refused_with_the_name_of_its_option(old_demo_copy, capsys, option, given):
+    with pytest.raises(SystemExit):
+        run("scale", old_demo_copy, *given)
+    said = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert f"{option}: expected three numbers such as 0,0,1, found '0,0'" in said

@@ -57,13 +57,19 @@ COMMANDS = {
 
 _REMEDIES = {
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "; allow it, or give another place"),
-    **dict.fromkeys((errno.EEXIST, errno.ENOTDIR), "; give another place"),
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "; free some space and run the same command again"),
 }
 """Remedies for errors of the system, by their numbers."""
 
 _PRINTING = ("query", "find", "list", "ask", "library", "encoders", "info")
 """Commands that have nothing left to do but to print when they begin to."""
+
+_UNSUITABLE = {
+    **dict.fromkeys((errno.EEXIST, errno.ENOTDIR), "expected a folder, found a file; give another place"),
+    errno.EISDIR: "expected a file, found a folder; give another name",
+    errno.ENOENT: "expected a path that exists or can be made, found none; check it, or give another place",
+}
+"""What is wrong with a path, by the numbers of errors of the system."""
 
 ALIASES = {"embed": "language"}
 """Other names of commands."""
@@ -115,8 +121,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         remedy = "rename the file or folder"
         print(f"error: {subject}: expected names in UTF-8, found other bytes; {remedy}", file=sys.stderr)
     except OSError as error:  # such as a full disk or a folder without permission
-        remedy = _REMEDIES.get(error.errno or 0, "")
-        print(f"error: {error.filename or 'output'}: {error.strerror or error}{remedy}", file=sys.stderr)
+        number = error.errno or 0
+        told = _UNSUITABLE.get(number, f"{error.strerror or error}{_REMEDIES.get(number, '')}")
+        print(f"error: {error.filename or 'output'}: {told}", file=sys.stderr)
     return 1
 
 

@@ -31,8 +31,8 @@ class Export:
     Args:
         scene: A scene folder, or the word "demo" for the bundled scene.
         file: The file to write.
-        select: Write only what matches these phrases (see lexsplat find --help). In .csv and .json: which Gaussian
-            matches which phrase.
+        select: Write only what matches these phrases (see lexsplat find --help). .json lists the Gaussians of each
+            phrase; .csv has a row for every Gaussian of the scene, with the phrase that it matches.
         view: Name of the view that left and right refer to.
         language: Include codes and codebook (.ply and .glb).
         force: Replace a file that exists without asking.

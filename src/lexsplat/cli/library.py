@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from lexsplat.cli.options import Device, check_phrases, print_json
+from lexsplat.cli.options import Device, check_phrases, note_unsaved, print_json
 from lexsplat.cli.waiting import LateProgress, starting
 from lexsplat.runtime.errors import FileFormatError, LibraryError, ModelError, SceneFolderError
 from lexsplat.runtime.progress import Event
@@ -127,6 +128,8 @@ class LibraryCommand:
             print(text)
 
     def _add(self, library: Library) -> dict[str, Any]:
+        from lexsplat.scenes.folder import SceneFolder
+
         records, failed = [], []
         for done, path in enumerate(self.words):
             library.listener(Event("scenes", done, len(self.words)))
@@ -140,6 +143,7 @@ class LibraryCommand:
                 continue
             records.append(dataclasses.asdict(record))
             self._say(f"{record.name}: added from {record.path}, {record.codes} codes of {record.clip}")
+            note_unsaved(SceneFolder.open(Path(path)), path)
         library.listener(Event("scenes", len(self.words), len(self.words)))
         return {"scenes": records, "failed": failed}
 
@@ -178,11 +182,21 @@ class LibraryCommand:
         return {"problems": [{"scene": name, "problem": problem} for name, problem in problems.items()]}
 
     def _search(self, library: Library) -> dict[str, Any]:
-        answers = []
+        from lexsplat.scenes.folder import SceneFolder
+
+        answers: list[dict[str, Any]] = []
+        noted: set[str] = set()
         for phrase in self.words:
             found = library.search(phrase, self.limit, confirm=self.confirm)
             answers.append(found.to_dict())
             self._say(repr(found))
+            for hit in found.hits:
+                if hit.scene not in noted:
+                    noted.add(hit.scene)
+                    with contextlib.suppress(
+                        SceneFolderError, FileFormatError
+                    ):  # the index answers without it
+                        note_unsaved(SceneFolder.open(Path(hit.path)), hit.path)
             if str(self.thumbnails) != "none":
                 self._write_thumbnails(found, answers[-1]["hits"])
         return {"phrases": answers}

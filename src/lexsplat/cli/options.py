@@ -77,11 +77,10 @@ def open_folder(path: str, shows_steps: bool = False) -> SceneFolder:
 
 def note_unsaved(folder: SceneFolder, given: str) -> None:
     """State on standard error that steps of an edit are not in the scene that a command reads."""
-    from lexsplat.scenes.unsaved import saving, unsaved_steps
+    from lexsplat.scenes.facts import unsaved_note
 
-    if count := unsaved_steps(folder):
-        steps = "1 step of lexsplat edit is" if count == 1 else f"{count:,} steps of lexsplat edit are"
-        print(f"note: {steps} not in this scene; {saving(given, count)}", file=sys.stderr)
+    if note := unsaved_note(folder, given):
+        print(f"note: {note}", file=sys.stderr)
 
 
 def note_hidden_demo(given: str) -> None:

@@ -9,6 +9,9 @@ from lexsplat.cli.options import Device, SceneArgument, open_folder, open_scene,
 from lexsplat.cli.values import Length
 from lexsplat.cli.waiting import starting
 
+_LONGEST = 1e9
+"""Longest distance in meters: nobody measures a million kilometers in a scene."""
+
 
 @dataclasses.dataclass
 class Scale:
@@ -52,14 +55,14 @@ class Scale:
             raise ValueError(
                 "--distance LENGTH goes with one of --between A B, --height-of A, --points X,Y,Z X,Y,Z"
             )
-        if self.distance is not None and not 0 < self.distance < float("inf"):
-            raise ValueError(f"distance must be positive, got {self.distance:g}")
+        if self.distance is not None and not 0 < self.distance <= _LONGEST:
+            raise ValueError(f"distance must be positive and at most {_LONGEST:g} m, got {self.distance:g}")
         if self.points is None and self.up is None:
             return
         from lexsplat.geometry.world import World, parse_vector
 
         for text in self.points or ():
-            parse_vector(text)
+            parse_vector(text, "points")
         if self.up is not None:
             World.of_cameras([]).with_up(parse_vector(self.up))  # raises for an invalid direction
 

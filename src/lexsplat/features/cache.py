@@ -320,9 +320,8 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _damaged(path: Path, error: Exception) -> FileFormatError:
-    return FileFormatError(
-        path,
-        expected="cached features",
-        found=f"{type(error).__name__} {error}"[:200],
-        remedy="delete the file and run again",
-    )
+    found = error.found if isinstance(error, FileFormatError) else str(error)
+    if isinstance(error, KeyError):
+        found = f"no {found}"
+    remedy = "delete the file and run again"
+    return FileFormatError(path, expected="cached features", found=found[:200], remedy=remedy)

@@ -127,8 +127,12 @@ def _poses_of(cameras: Mapping[str, Camera]) -> str:
     return digest(name.encode("utf-8", "surrogatepass") + pose.tobytes() for name, pose in poses)
 
 
-def parse_vector(text: str) -> tuple[float, float, float]:
+def parse_vector(text: str, name: str = "up") -> tuple[float, float, float]:
     """Three finite numbers from "x,y,z".
+
+    Args:
+        text: The text.
+        name: What it is given for, for the error.
 
     Raises:
         ValueError: If the text is not that.
@@ -138,5 +142,5 @@ def parse_vector(text: str) -> tuple[float, float, float]:
     except ValueError:
         numbers = []
     if len(numbers) != 3 or not all(math.isfinite(number) for number in numbers):
-        raise ValueError(f"three numbers like 0,0,1 are needed, got {text!r}")
+        raise ValueError(f"{name}: expected three numbers such as 0,0,1, found {text!r}")
     return numbers[0], numbers[1], numbers[2]

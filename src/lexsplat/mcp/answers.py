@@ -19,6 +19,9 @@ Present = Annotated[
 Vector = Annotated[list[float], Field(min_length=3, max_length=3, description="x, y, z in scene units.")]
 View = Annotated[str | None, Field(description="Name of the view that shows it best.")]
 Count = Annotated[int, Field(ge=0)]
+Unsaved = Annotated[
+    int, Field(ge=0, description="Steps of lexsplat edit and the viewer that the scene does not hold.")
+]
 
 Up = TypedDict(
     "Up",
@@ -100,6 +103,7 @@ class FindAnswer(World):
 
     scene: str | None
     rests_on: Annotated[str, Field(description="What relevancy and presence are relative to.")]
+    unsaved_steps: Unsaved
     phrases: list[Answer]
 
 
@@ -146,6 +150,7 @@ class Facts(TypedDict):
     views: Count
     meters_per_unit: float | None
     method: str
+    unsaved_steps: Unsaved
 
 
 class SceneFacts(TypedDict):
@@ -156,6 +161,7 @@ class SceneFacts(TypedDict):
     views: NotRequired[Count]
     meters_per_unit: NotRequired[float | None]
     method: NotRequired[str]
+    unsaved_steps: NotRequired[Unsaved]
     problem: NotRequired[Annotated[str, Field(description="Why it cannot be asked.")]]
 
 
@@ -287,6 +293,7 @@ class ExportAnswer(World, Asked):
 
     files: list[str]
     gaussians: Count
+    unsaved_steps: Unsaved
 
 
 class EditAnswer(World, Asked):

@@ -27,6 +27,7 @@ from lexsplat.mcp.lines import messages
 from lexsplat.mcp.tools import LibraryTools, Reply, Tools
 from lexsplat.mcp.writing import WritingTools
 from lexsplat.runtime.errors import LexsplatError, QueryError
+from lexsplat.scenes.facts import unsaved_note
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.serving import OpenScene, error_document
 
@@ -60,12 +61,12 @@ def make_server(
     tools = Tools(scenes) if library is None else LibraryTools(scenes, library)
     reading = ToolAnnotations(read_only_hint=True, open_world_hint=False)
     for name in _public(type(tools)):
-        server.add_tool(_tool(getattr(tools, name)), name=name, annotations=reading)
+        server.add_tool(_tool(tools, name), name=name, annotations=reading)
     if output is not None:
         writing = WritingTools(scenes, output, library)
         for name in sorted(set(_public(WritingTools)) - set(_public(Tools))):
             server.add_tool(
-                _tool(getattr(writing, name)), name=name, annotations=ToolAnnotations(read_only_hint=False)
+                _tool(writing, name), name=name, annotations=ToolAnnotations(read_only_hint=False)
             )
     _add_resources(server, tools)
     _add_prompts(server, tools)
@@ -201,11 +202,13 @@ def _public(kind: type) -> list[str]:
     return [name for name, _ in inspect.getmembers(kind, inspect.isfunction) if not name.startswith("_")]
 
 
-def _tool(function: Callable[..., Reply]) -> Callable[..., CallToolResult]:
+def _tool(tools: Tools, name: str) -> Callable[..., CallToolResult]:
     """A tool of the protocol: structured content and one sentence; errors that have a remedy are answers.
 
-    Its output schema is that of the document type in the function's return annotation.
+    Its output schema is that of the document type in the function's return annotation. The sentence about a scene
+    says if steps of an edit are not in it.
     """
+    function: Callable[..., Reply] = getattr(tools, name)
     # The package reads names and types from the signature; its annotations are strings of the other module.
     hints = inspect.signature(function, eval_str=True)
 
@@ -213,9 +216,11 @@ def _tool(function: Callable[..., Reply]) -> Callable[..., CallToolResult]:
     def call(**arguments: Any) -> CallToolResult:
         try:
             reply = function(**arguments)
+            place = tools._scene(arguments.get("scene", "")) if "scene" in hints.parameters else None
         except LexsplatError as error:
             return _refusal(error)
-        content: list[Any] = [TextContent(text=reply.sentence)]
+        note = unsaved_note(place.folder) if place is not None else ""
+        content: list[Any] = [TextContent(text=f"{reply.sentence} Note: {note}." if note else reply.sentence)]
         if reply.image is not None:
             import base64
 

@@ -25,6 +25,7 @@ from lexsplat.scenes.library import Library
 from lexsplat.scenes.objects import list_document
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.serving import MAX_LINE, OpenScene, counted, placed, qualified, sentence, shortened
+from lexsplat.scenes.unsaved import unsaved_steps
 
 SceneName = Annotated[str, Field(description="Name from list_scenes; may be left out if there is one scene.")]
 PhraseText = Annotated[
@@ -68,9 +69,7 @@ class Tools:
         """List the places that can be searched."""
         listed = [{"name": name, **_facts_or_problem(served)} for name, served in self.scenes.items()]
         document: dict[str, Any] = {"scenes": listed}
-        names = [
-            f"{each['name']} ({each['problem']})" if "problem" in each else each["name"] for each in listed
-        ]
+        names = [f"{each['name']}{_remark(each)}" for each in listed]
         text = f"{counted(len(listed), 'scene')}: {', '.join(names)}." if listed or not self.library else ""
         if self.library is not None:
             try:
@@ -376,6 +375,7 @@ def _facts(scene: Scene) -> dict[str, Any]:
         "views": len(scene.views),
         "meters_per_unit": scene.world.meters_per_unit,
         "method": scene.field.method,
+        "unsaved_steps": unsaved_steps(scene.folder) if scene.folder else 0,
     }
 
 
@@ -384,6 +384,12 @@ def _facts_or_problem(served: OpenScene) -> dict[str, Any]:
         return _facts(served.scene)
     except LexsplatError as error:  # the other scenes are listed all the same
         return {"problem": str(error)}
+
+
+def _remark(facts: Mapping[str, Any]) -> str:
+    if "problem" in facts:
+        return f" ({facts['problem']})"
+    return f" ({counted(facts['unsaved_steps'], 'unsaved step')})" if facts["unsaved_steps"] else ""
 
 
 def _found(scene: Scene, phrase: str) -> tuple[list[Selection], dict[str, Any]]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from collections.abc import Iterator, MutableMapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+from anyio import from_thread
 from pydantic import Field
 
 from lexsplat.mcp import answers
@@ -18,6 +20,7 @@ from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.exporting import ending_of, export_scene, exported
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.serving import OpenScene, counted, new_name, qualified, sentence, shortened
+from lexsplat.scenes.unsaved import unsaved_steps
 
 FileName = Annotated[str, Field(description='Name of a new file without a folder, such as "duck.ply".')]
 
@@ -49,7 +52,14 @@ class WritingTools(Tools):
         written, count = [str(each) for each in files], len(exported(place, path, [found])[0])
         text = f"{counted(count, 'Gaussian')} of {shortened(asked['understood'])} written to {written[0]}."
         return Reply(
-            qualified(text, asked), {**place.world.to_json(), **asked, "files": written, "gaussians": count}
+            qualified(text, asked),
+            {
+                **place.world.to_json(),
+                **asked,
+                "files": written,
+                "gaussians": count,
+                "unsaved_steps": unsaved_steps(place.folder) if place.folder else 0,
+            },
         )
 
     def edit(
@@ -112,22 +122,30 @@ class WritingTools(Tools):
 
     def _new(self, argument: str, name: str) -> Path:
         path = self.output / name
-        if (
-            not name
-            or name != name.strip()
-            or Path(name).name != name
-            or name.startswith(".")
-            or not name.isprintable()
-            or len(name) > 100
-        ):
+        if wrong := _wrong_with(name):
             raise QueryError(
-                argument, expected="a plain name of at most 100 characters", found=repr(name[:60])
+                argument,
+                expected="a plain name of at most 100 characters",
+                found=f"{name[:60]!r}, {wrong}",
+                remedy=f'give one such as "duck{".ply" if argument == "file" else ""}"; --output is its folder',
             )
         if path.exists() or path.is_symlink():
-            raise SceneFolderError(
-                path, expected="a new name", found="a file that exists", remedy="give another name"
-            )
+            found = f"a {'folder' if path.is_dir() else 'file'} that exists"
+            raise SceneFolderError(path, expected="a new name", found=found, remedy="give another name")
         return path
+
+
+def _wrong_with(name: str) -> str:
+    """What keeps a text from being the name of a new file; empty if nothing does."""
+    faults = {
+        "which is empty": not name.strip(),
+        "which has spaces at an end": name != name.strip(),
+        "which has characters that cannot be printed": not name.isprintable(),
+        "which is a path": Path(name).name != name,
+        "which begins with a dot": name.startswith("."),
+        f"which has {len(name)} characters": len(name) > 100,
+    }
+    return next((fault for fault, holds in faults.items() if holds), "")
 
 
 def check_output(output: Path) -> None:
@@ -152,10 +170,19 @@ def check_output(output: Path) -> None:
 
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Make the folder of a new file; errors of the disk in the block get a remedy."""
+    """Make the folder of a new file or folder; errors of the disk in the block get a remedy.
+
+    A call that its client has cancelled writes nothing: what was written meanwhile is removed.
+    """
     try:
+        _end_if_cancelled()
         path.parent.mkdir(parents=True, exist_ok=True)
         yield
+        try:
+            _end_if_cancelled()
+        except BaseException:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+            raise
     except OSError as error:
         raise SceneFolderError(
             error.filename or path,
@@ -163,3 +190,9 @@ def _writing(path: Path) -> Iterator[None]:
             found=error.strerror or repr(error)[:80],
             remedy="make room or change its permissions, or start the server with another --output",
         ) from error
+
+
+def _end_if_cancelled() -> None:
+    """End this thread's work, with the exception of its event loop, if the client has cancelled the call."""
+    with contextlib.suppress(RuntimeError):  # called by a program, without an event loop
+        from_thread.check_cancelled()

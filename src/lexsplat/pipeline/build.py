@@ -6,6 +6,7 @@ the photos, the cameras, its settings and the stages before it.
 
 from __future__ import annotations
 
+import logging
 import shutil
 import time
 from collections.abc import Callable
@@ -27,6 +28,7 @@ from lexsplat.pipeline.inputs import (
     check_given_maps,
     check_photos,
     prepare_capture,
+    refuse_output_in_capture,
     refuse_without_cameras,
     survey_photos,
 )
@@ -59,6 +61,8 @@ from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.foreign import warnings_once
 from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.previous import drop_previous
+
+log = logging.getLogger("lexsplat")
 
 STAGES = ("reconstruct", "features", "codebook", "language")
 """Names of all stages; the method has those of a build and their order (`LanguageMethod.stages`)."""
@@ -101,6 +105,8 @@ def build(
     config = replace(config, encoder_device=choose_encoder_device(config.encoder_device, device))  # type: ignore[arg-type]
     if device == "cuda":
         require_gsplat()  # before anything that takes time
+    if source is not None:
+        refuse_output_in_capture(source, Path(output))
     folder = SceneFolder(Path(output))
     folder.refuse_foreign_files()
     is_new = not folder.root.exists()
@@ -238,13 +244,24 @@ class _Builder:
         ])  # fmt: skip
 
     def _is_finished(self, name: str, stage: _Stage) -> bool:
-        return self.folder.is_finished(name, self._fingerprint(stage)) and all(
-            path.exists() for path in stage.outputs
-        )
+        """Whether the files of a stage are those that a build with these inputs makes, and whole."""
+        if not self.folder.is_finished(name, self._fingerprint(stage)):
+            return False
+        if not all(path.exists() for path in stage.outputs):
+            return False
+        try:
+            for path in stage.outputs:
+                self.folder.check_file(path)
+        except FileFormatError as error:
+            log.warning("%s: %s; the stage %s runs again", error.subject, error.found, name)
+            return False
+        return True
 
     def _run_stage(self, name: str, stage: _Stage) -> None:
         key = self.fingerprints[name] = self._fingerprint(stage)
         if self._is_finished(name, stage):
+            done = self.folder.record["stages"]
+            done[name] = done.pop(name)  # in the order of the stages, whichever ran before
             warn_again(self.folder.record["stages"][name])
             self.listener(Event(name, 1, 1, {"kept": 1.0}))
             return
@@ -252,8 +269,10 @@ class _Builder:
         start = time.perf_counter()
         path = self._checkpoints / f"{name}.training.safetensors"
         self.checkpoint = Checkpoint(path, key, every=self.config.checkpoint_seconds)
-        with kept_warnings() as warnings:
-            facts = stage.work()
+        before = self.folder.record.get("checksums")
+        facts, warnings = self._with_whole_features(stage.work)
+        if name == "reconstruct" and self.folder.record.get("checksums") != before:
+            self.folder.reopen("language")  # made for other Gaussians, even where all settings are the same
         seconds = self.checkpoint.seconds_before + time.perf_counter() - start
         self.folder.finish(name, key, seconds, **facts, **({"warnings": warnings} if warnings else {}))
         record_warnings(self.folder, self.capture)
@@ -264,6 +283,22 @@ class _Builder:
         if self._maps is not None:
             self._maps.forget()  # the next stage needs the memory of the features kept so far
         budget.give_back_freed()
+
+    def _with_whole_features(self, work: Callable[[], dict[str, Any]]) -> tuple[dict[str, Any], list[str]]:
+        """Facts and warnings of the work of a stage; a damaged file of the feature cache is made again, once."""
+        mended: set[Path] = set()
+        while True:
+            try:
+                with kept_warnings() as warnings:
+                    return work(), warnings
+            except FileFormatError as error:
+                damaged = Path(error.subject)
+                if damaged.parent != self.folder.features_path or damaged in mended:
+                    raise
+                log.warning("%s: %s; its features are made again", damaged, error.found)
+                mended.add(damaged)
+                damaged.unlink(missing_ok=True)
+                self._maps = None  # made anew, it encodes the photos whose features are missing
 
     # -- the work of each stage
 

@@ -26,6 +26,7 @@ from lexsplat.captures import (
     poses_from_photos,
 )
 from lexsplat.captures.ground_truth.layouts import annotated_names
+from lexsplat.captures.images.reading import IMAGE_SUFFIXES
 from lexsplat.captures.loading import check_capture
 from lexsplat.captures.readers.video import is_video, require_video, sample_video
 from lexsplat.captures.sfm.preparation import (
@@ -49,6 +50,26 @@ from lexsplat.scenes.folder import SceneFolder
 log = logging.getLogger("lexsplat")
 
 _VIDEO_SIZE = (1920, 1080)
+
+
+def refuse_output_in_capture(source: Path, output: Path) -> None:
+    """Refuse to mix the files of a scene into a capture; a new folder within the capture is welcome.
+
+    Raises:
+        CaptureError: If the output is the folder of the capture, or one in it that holds images.
+    """
+    place, capture = output.resolve(), source.resolve()
+    if source.suffix == ".json":  # a transforms.json in place of its folder
+        capture = capture.parent
+    if not place.is_dir() or not place.is_relative_to(capture):
+        return
+    if place == capture or any(file.suffix.lower() in IMAGE_SUFFIXES for file in place.iterdir()):
+        raise CaptureError(
+            output,
+            expected="an output folder of its own",
+            found=f"a folder of the capture {source}",
+            remedy="give another --output",
+        )
 
 
 def prepare_capture(
@@ -75,13 +96,6 @@ def prepare_capture(
         return load_capture(source, test_every=config.test_every, test_names=test_names)
     poses = folder.root / "poses"
     photos = _frames_folder(folder.root) if is_video(source) else photo_folder(source)
-    if folder.root.resolve() in (photos.resolve(), source.resolve()):
-        raise CaptureError(
-            folder.root,
-            expected="an output folder of its own",
-            found="the folder of the photos",
-            remedy="give another --output",
-        )
     images = _registered_images(source, photos, folder, config, listener)
     folder.record["images"] = images
     folder.record["capture"] = str(source.resolve())

@@ -228,10 +228,10 @@ def cut_blocks(
     views = capture.train_views
     if len(views) < 2 * count:
         raise CaptureError(
-            f"--blocks {count}",
+            f"{count} blocks",
             expected=f"at least {2 * count} training views",
             found=str(len(views)),
-            remedy="give a smaller --blocks, or more --memory where --blocks is auto",
+            remedy=f"give at most --blocks {len(views) // 2}; --blocks auto takes fewer with more --memory",
         )
     cells = tuple(Cell(*ends) for ends in _cut(points @ axes.T, count))
     homes = _cells_of(points, cells, axes)

@@ -1,8 +1,9 @@
 """Hashes and stamps that detect whether an input has changed since a result was computed from it.
 
-"The same file" has three meanings, by what is at stake:
+"The same file" has four meanings, by what is at stake:
 
 - content (`file_hash`): results that are recorded, or cached for other folders and machines;
+- content, as far as damage goes (`file_checksum`): files that are read as a whole whenever a scene is opened;
 - name, size and modification time (`file_stamp`): intermediate files of one machine, where a pass over all photos
   would cost too much;
 - name, size and both ends (`file_sample`): the photos of a finished "poses" stage, which users copy and sync without
@@ -14,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -60,6 +62,14 @@ def file_sample(path: Path) -> str:
             file.seek(place)
             parts.append(file.read(_SAMPLE))
     return digest(parts)
+
+
+def file_checksum(path: Path) -> int:
+    """CRC-32 of a file's content: several times faster than a hash, and misses one damaged file in four billion."""
+    found = 0
+    for block in blocks(path):
+        found = zlib.crc32(block, found)
+    return found
 
 
 def blocks(path: Path) -> Iterator[bytes]:

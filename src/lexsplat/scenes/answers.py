@@ -30,6 +30,7 @@ from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.progress import Event
 from lexsplat.runtime.sampling import evenly
+from lexsplat.scenes.unsaved import unsaved_steps
 from lexsplat.scenes.words import Word, members_of_kind
 
 if TYPE_CHECKING:
@@ -237,7 +238,7 @@ def find_phrases(
         threshold: Smallest score of a selected Gaussian; None derives one for each phrase.
 
     Returns:
-        ``{"scene", "up", "meters_per_unit", "rests_on", "phrases": [...]}``; a phrase has "phrase",
+        ``{"scene", "up", "meters_per_unit", "rests_on", "unsaved_steps", "phrases": [...]}``; a phrase has "phrase",
         "understood", "present", "count", "gaussians", "threshold", "best_view" and "instances" with center, size and
         axes in world units, and "size_meters" if the scale is known. If "present" is "no", "count" is 0 and
         "instances" is empty.
@@ -250,6 +251,7 @@ def find_phrases(
         "scene": str(scene.folder.root) if scene.folder else None,
         "rests_on": rests_on(scene),
         **scene.world.to_json(),
+        "unsaved_steps": unsaved_steps(scene.folder) if scene.folder else 0,
         "phrases": answers,
     }
 

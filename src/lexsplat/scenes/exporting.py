@@ -129,8 +129,8 @@ def export_scene(
 
     Args:
         scene: The scene.
-        path: A splat format (see `export_gaussians`); ``.csv`` for one line per Gaussian; ``.json`` for the
-            selections with boxes and indices.
+        path: A splat format (see `export_gaussians`); ``.csv`` for one line per Gaussian of the scene, with an empty
+            label where no selection has it; ``.json`` for the selections with boxes and indices.
         found: Selections (`Scene.find`); splat formats then hold only their Gaussians.
         language: Include codes and codebook.
         overwrite: Replace files that exist; files of the scene itself are never replaced.
@@ -147,6 +147,7 @@ def export_scene(
     if scene.folder is not None:
         scene.folder.refuse_own_file(path)
     if ending in LABEL_ENDINGS and found:
+        _require_something(found, found)
         if not overwrite:
             _refuse_existing([path])
         with atomic_path(path) as temporary:
@@ -160,17 +161,23 @@ def export_scene(
     stored = stored_language(scene.field, scene.encoder_identity()) if language else None
     gaussians = scene.gaussians
     if found:
-        mask = torch.stack([thing.mask for thing in exported(scene, path, found)]).any(0)
-        if not mask.any():
-            raise QueryError(
-                ", ".join(selection.phrase for selection in found),
-                expected="something to write",
-                found="nothing",
-                remedy="try other words or a lower threshold",
-            )
+        things = exported(scene, path, found)
+        _require_something(found, things)
+        mask = torch.stack([thing.mask for thing in things]).any(0)
         gaussians = gaussians.select(mask)
         stored = stored.select(mask.cpu()) if stored else None
     return export_gaussians(gaussians, path, language=stored, world=scene.world, overwrite=overwrite)
+
+
+def _require_something(found: Sequence[Selection], things: Sequence[Selection]) -> None:
+    """Refuse phrases that select nothing, in every format."""
+    if not any(things):
+        raise QueryError(
+            ", ".join(selection.phrase for selection in found),
+            expected="something to write",
+            found="nothing",
+            remedy="try other words or a lower threshold",
+        )
 
 
 def exported(scene: Scene, path: Path, found: Sequence[Selection]) -> list[Selection]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from lexsplat.geometry.world import world_of
 from lexsplat.scenes.folder import SceneFolder
-from lexsplat.scenes.unsaved import unsaved_steps
+from lexsplat.scenes.unsaved import saving, unsaved_steps
 
 NO_SEGMENTS = (
     "single Gaussians answer; lexsplat language CAPTURE --output SCENE, with the options of the build, adds segments"
@@ -28,6 +28,21 @@ def _chosen_views(record: Mapping[str, Any]) -> dict[str, Any] | None:
         return None
     names = ("splats", "views", "candidates", "visible", "unseen", "floaters")
     return {name: record["stages"]["views"].get(name) for name in names}
+
+
+def unsaved_note(folder: SceneFolder | None, given: str = "") -> str:
+    """That steps of an edit are not in the scene that answers, and how to get them; empty without such steps.
+
+    Args:
+        folder: The scene folder; None for a scene in memory.
+        given: How the user named the scene, if not by its folder.
+    """
+    count = unsaved_steps(folder) if folder is not None else 0
+    if folder is None or not count:
+        return ""
+    steps = "1 step of lexsplat edit is" if count == 1 else f"{count:,} steps of lexsplat edit are"
+    named = given or ("demo" if folder.is_bundled else str(folder.root))
+    return f"{steps} not in this scene; {saving(named, count)}"
 
 
 def scene_facts(folder: SceneFolder) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 ::
 
-    scene.json            format_version, config, provenance, fingerprint of each finished stage
+    scene.json            format_version, config, provenance, fingerprint of each finished stage, checksums
     cameras.json          views, intrinsics, poses, split
     gaussians.ply         the standard 3DGS PLY
     language.safetensors  the language field with its codebook
@@ -32,7 +32,8 @@ from lexsplat.captures.splits import match_stem
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
-from lexsplat.runtime.files import atomic_path, locked, read_json, to_json, write_json
+from lexsplat.runtime.files import atomic_path, locked, read_json, read_tensors, to_json, write_json
+from lexsplat.runtime.fingerprints import file_checksum
 from lexsplat.scenes.records import FORMAT_VERSION, read_record
 
 SCENE_FILES = ("scene.json", "cameras.json", "gaussians.ply", "language.safetensors")
@@ -106,7 +107,8 @@ class SceneFolder:
         self.content = self.root if content is None else content
         self.record: dict[str, Any] = {"format_version": FORMAT_VERSION, "stages": {}}
         if self._record_path.exists():
-            self.record = read_record(read_json(self._record_path), self._record_path)
+            remedy = f"restore it from a copy, or delete {', '.join(SCENE_FILES)} and run the build again"
+            self.record = read_record(read_json(self._record_path, remedy=remedy), self._record_path)
 
     @classmethod
     def open(cls, root: Path) -> SceneFolder:
@@ -302,7 +304,7 @@ class SceneFolder:
             FileFormatError: If ``cameras.json`` is missing or malformed.
         """
         path = self.content / "cameras.json"
-        content = read_json(path)
+        content = read_json(path, remedy="run the build again")
         try:
             views = [_stored_view(entry, path) for entry in content["views"]]
             if len({view.name for view in views}) < len(views):
@@ -317,17 +319,61 @@ class SceneFolder:
         return {view.name: view for view in views}
 
     def write_gaussians(self, gaussians: Gaussians) -> None:
-        """Write ``gaussians.ply``."""
+        """Write ``gaussians.ply``; the record receives its checksum, which `save` writes."""
         from lexsplat.scenes.formats.ply import write_ply
 
         with atomic_path(self.gaussians_path) as temporary:
             write_ply(gaussians, temporary)
+            self.record["checksums"] = {self.gaussians_path.name: file_checksum(temporary)}
 
     def read_gaussians(self) -> Gaussians:
-        """Read ``gaussians.ply``."""
+        """Read ``gaussians.ply``.
+
+        Raises:
+            FileFormatError: If it is missing or damaged, or another file than `write_gaussians` wrote.
+        """
         from lexsplat.scenes.formats.ply import read_ply
 
-        return read_ply(self.gaussians_path)
+        self._has_whole_gaussians()
+        try:
+            return read_ply(self.gaussians_path)
+        except FileFormatError as error:  # whose advice is for a file of another program
+            facts = {"expected": error.expected, "found": error.found, "remedy": "run the build again"}
+            raise FileFormatError(error.subject, **facts) from error
+
+    def _has_whole_gaussians(self) -> bool:
+        """Whether ``gaussians.ply`` is known to be as it was written.
+
+        It is not known while it is being made, and in folders that were built without a checksum.
+
+        Raises:
+            FileFormatError: If it is known not to be.
+        """
+        path = self.gaussians_path
+        known = self.record.get("checksums", {}).get(path.name)
+        if known is None or "reconstruct" not in self.record["stages"] or not path.is_file():
+            return False
+        if file_checksum(path) != known:
+            raise FileFormatError(
+                path,
+                expected="the Gaussians that were written",
+                found="other content (the checksum differs)",
+                remedy="run the build again; for Gaussians of another program: lexsplat language --splats FILE",
+            )
+        return True
+
+    def check_file(self, path: Path) -> None:
+        """Read a file of a finished stage as queries and later stages will; folders are not read.
+
+        Raises:
+            FileFormatError: If it is damaged.
+        """
+        if path == self.gaussians_path:
+            _ = self._has_whole_gaussians() or self.read_gaussians()
+        elif path.suffix == ".safetensors":
+            read_tensors(path)
+        elif path.suffix == ".png":
+            self.read_code_map(path.relative_to(self.root / "codes").as_posix())
 
     def write_code_map(self, name: str, codes: np.ndarray) -> None:
         """Write one code index map, uint8 ``[h, w]``, as PNG."""

@@ -73,6 +73,7 @@ def _checked(record: Any, path: Path) -> dict[str, Any]:
         "downscale": scale is None or (isinstance(scale, (int, float)) and 0 < scale < 1e6),
         "provenance": isinstance(record.get("provenance", {}), dict),
         "warnings": isinstance(record.get("warnings", []), list),
+        "checksums": isinstance(record.get("checksums", {}), dict),
         "capture": isinstance(record.get("capture"), (str, type(None))),
         "images": isinstance(record.get("images"), (str, type(None))),
     }

@@ -14,6 +14,9 @@ from lexsplat.scenes.scene import Scene
 
 log = logging.getLogger("lexsplat")
 
+_SCALES = (1e-9, 1e9)
+"""Meters in a unit, at least and at most. Beyond, a distance or its unit is mistyped."""
+
 
 def length_between(scene: Scene, first: str, second: str) -> float:
     """Distance in world units between the centers of two objects, found by phrases.
@@ -62,9 +65,17 @@ def store_world(
 
     Raises:
         SceneFolderError: If the scene is the bundled one, or another process builds there.
+        QueryError: If the scale is out of all bounds.
         ValueError: If a number is invalid.
     """
     root.refuse_bundled()
+    if meters_per_unit is not None and not _SCALES[0] <= meters_per_unit <= _SCALES[1]:
+        raise QueryError(
+            "scale",
+            expected=f"a unit of {_SCALES[0]:g} to {_SCALES[1]:g} m",
+            found=f"{meters_per_unit:g} m",
+            remedy="check the distance, its unit and what it is the distance of",
+        )
     with root.locked():
         folder = SceneFolder.open(root.root)
         cameras = {name: view.camera for name, view in folder.read_cameras().items()}

@@ -7,6 +7,7 @@ of the known poses are dropped, and the rest is triangulated with fixed poses.
 
 from __future__ import annotations
 
+import logging
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,8 @@ from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+log = logging.getLogger("lexsplat")
 
 STAGE = "triangulate"
 ENOUGH_POINTS = 200
@@ -71,7 +74,7 @@ def initial_points(
     """The best available initial points.
 
     These are the points of the capture where there are enough, else points triangulated with the known poses, else
-    ``count`` random points that several cameras see.
+    ``count`` random points that several cameras see, with a warning.
 
     Args:
         capture: The capture.
@@ -93,6 +96,12 @@ def initial_points(
     found = len(points)
     points, colors = random_points_in_frusta(capture, count, np.random.default_rng(seed))
     note = f"{len(points):,} random points (only {found} could be triangulated)"
+    log.warning(
+        "the training starts from %s, which costs several dB: %d are needed; take photos that overlap by 60 to 80"
+        " percent and show texture, and check that given poses belong to them",
+        note,
+        ENOUGH_POINTS,
+    )
     return InitialPoints(points, colors, "random", note)
 
 

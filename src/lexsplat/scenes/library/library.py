@@ -195,19 +195,21 @@ class Library:
         key = f"{path} {stamp}"
         known = self._states.get(record.name)
         if stamp is None or thoroughly or known is None or known[0] != key:
-            try:
-                known = self._states[record.name] = (key, state_of(SceneFolder.open(path)))
-            except LexsplatError as error:
-                raise self._unusable(record, error) from error
+            known = self._states[record.name] = (key, state_of(self._opened(record)))
         return known[1] != record.state
 
-    def _unusable(self, record: Record, error: LexsplatError) -> LexsplatError:
-        """The error of a scene that cannot be read, with what can be done about its entry."""
-        remove = command("remove", self.root, record.name)
-        remedy = f"if it was moved: {command('add', self.root, 'NEW_PLACE')}; if it is gone: {remove}"
-        if (self.folder(record) / "scene.json").is_file():
-            remedy = f"{error.remedy or 'build it again'}, or: {remove}"
-        return type(error)(error.subject, expected=error.expected, found=error.found, remedy=remedy)
+    def _opened(self, record: Record) -> SceneFolder:
+        """The folder of a scene; if it cannot be read, the error has what can be done about its entry."""
+        try:
+            return SceneFolder.open(self.folder(record))
+        except LexsplatError as error:
+            remove = command("remove", self.root, record.name)
+            remedy = f"if it was moved: {command('add', self.root, 'NEW_PLACE')}; if it is gone: {remove}"
+            if (self.folder(record) / "scene.json").is_file():
+                remedy = f"{error.remedy or 'build it again'}, or: {remove}"
+            raise type(error)(
+                error.subject, expected=error.expected, found=error.found, remedy=remedy
+            ) from error
 
     def scene(self, name: str) -> Scene:
         """A scene, as it is now.
@@ -220,9 +222,9 @@ class Library:
         record = self.record(name)
         if record is None:
             raise self.damaged.get(name) or self._unknown(name)
-        path = self.folder(record)
-        key = (name, str(path), state_of(SceneFolder.open(path)))
-        return self._scenes.get_or_make(key, lambda: self._open(path))
+        folder = self._opened(record)
+        key = (name, str(folder.root), state_of(folder))
+        return self._scenes.get_or_make(key, lambda: self._open(folder.root))
 
     def _open(self, path: Path) -> Scene:
         """A scene that shares text embeddings and encoders with the others."""
