@@ -103,6 +103,7 @@ def build(
         require_gsplat()  # before anything that takes time
     folder = SceneFolder(Path(output))
     folder.refuse_foreign_files()
+    folder.refuse_edited()
     is_new = not folder.root.exists()
     above = [place for place in folder.root.absolute().parents if not place.exists()]
     given = (source,) if source is not None and source.is_dir() else ()  # of a video workers get the frames

@@ -11,7 +11,7 @@ from lexsplat.scenes.unsaved import unsaved_steps
 
 NO_SEGMENTS = (
     "single Gaussians answer; lexsplat language CAPTURE --output SCENE, with the options of the build, adds segments"
-    " (method averaged)"
+    " (method averaged) to a scene without edits"
 )
 """A note on a scene without segments: the consequence, and how to add them."""
 

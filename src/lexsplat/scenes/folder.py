@@ -218,6 +218,20 @@ class SceneFolder:
                 remedy="give another --output",
             )
 
+    def refuse_edited(self) -> None:
+        """Refuse to build into a saved edit, whose photos are of the scene before its edits.
+
+        Raises:
+            SceneFolderError: If ``scene.json`` lists edits.
+        """
+        if edits := self.record.get("edits"):
+            raise SceneFolderError(
+                self.root,
+                expected="a new folder or a scene without edits",
+                found=f"a scene with {len(edits)} edit{'' if len(edits) == 1 else 's'}, which a build would undo",
+                remedy="give another --output, and edit the scene that is built there",
+            )
+
     # -- stages
 
     def is_finished(self, stage: str, fingerprint: str) -> bool:
