@@ -247,7 +247,9 @@ def test_info_counts_the_steps_that_the_scene_does_not_hold(with_a_step, capsys)
     assert json.loads(capsys.readouterr().out)["unsaved_steps"] == 1
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff\n", b"{}\n3\n", b'{}\n{"undo": true}\n', b"{}\n{\n"])
+@pytest.mark.parametrize(
+    "content", [b"", b"\xff\n", b"{}\n3\n", b'{}\n{"undo": true}\n', b"{}\n{\n", b"{}\n{}\n{}\n3\n"]
+)
 def test_a_damaged_journal_has_no_steps_to_note(tmp_path, content):
     folder = SceneFolder(tmp_path)
     (tmp_path / "edits.jsonl").write_bytes(content)

@@ -59,7 +59,7 @@ def open_scene(path: str, device: str, clip: str | None, shows_steps: bool = Fal
         scene = search.open_scene(path, device=device, clip=clip)
     scene.listener = listener
     if scene.folder is not None and not shows_steps:
-        note_unsaved(scene.folder, path)
+        note_version(scene.folder, path)
     return scene
 
 
@@ -68,20 +68,29 @@ def open_folder(path: str, shows_steps: bool = False) -> SceneFolder:
     note_hidden_demo(path)
     with starting():
         from lexsplat.scenes.folder import SceneFolder
+        from lexsplat.scenes.previous import version_that_answers
 
-    folder = SceneFolder.open(Path(path))
+    folder = version_that_answers(SceneFolder.open(Path(path)))
     if not shows_steps:
-        note_unsaved(folder, path)
+        note_version(folder, path)
     return folder
 
 
-def note_unsaved(folder: SceneFolder, given: str) -> None:
-    """State on standard error that steps of an edit are not in the scene that a command reads."""
-    from lexsplat.scenes.unsaved import saving, unsaved_steps
+def note_version(folder: SceneFolder, given: str) -> None:
+    """State on standard error what the scene that a command reads does not hold: a rebuild, or steps of an edit."""
+    from lexsplat.scenes.previous import REBUILD
+    from lexsplat.scenes.unsaved import discarding, outdated_steps, saving, unsaved_steps
 
+    def steps(count: int) -> str:
+        return "1 step of lexsplat edit" if count == 1 else f"{count:,} steps of lexsplat edit"
+
+    if folder.content != folder.root:
+        print(f"note: this is the scene before a rebuild, which {REBUILD}", file=sys.stderr)
     if count := unsaved_steps(folder):
-        steps = "1 step of lexsplat edit is" if count == 1 else f"{count:,} steps of lexsplat edit are"
-        print(f"note: {steps} not in this scene; {saving(given, count)}", file=sys.stderr)
+        verb = "is" if count == 1 else "are"
+        print(f"note: {steps(count)} {verb} not in this scene; {saving(given, count)}", file=sys.stderr)
+    if count := outdated_steps(folder):
+        print(f"note: {steps(count)} {discarding(given, count)}", file=sys.stderr)
 
 
 def note_hidden_demo(given: str) -> None:

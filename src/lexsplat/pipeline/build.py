@@ -6,11 +6,13 @@ the photos, the cameras, its settings and the stages before it.
 
 from __future__ import annotations
 
+import logging
 import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from lexsplat.captures import Capture, View, load_annotations
@@ -32,6 +34,7 @@ from lexsplat.pipeline.inputs import (
 )
 from lexsplat.pipeline.provenance import (
     features_identity,
+    hash_capture,
     model_place,
     record_warnings,
     with_full_paths,
@@ -59,6 +62,9 @@ from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.foreign import warnings_once
 from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.previous import drop_previous
+from lexsplat.scenes.unsaved import refuse_to_lose_steps
+
+log = logging.getLogger("lexsplat")
 
 STAGES = ("reconstruct", "features", "codebook", "language")
 """Names of all stages; the method has those of a build and their order (`LanguageMethod.stages`)."""
@@ -171,7 +177,7 @@ class _Stage:
 
 
 class _Builder:
-    """The stages of one build. ``fingerprints`` holds those of the stages done so far."""
+    """The stages of one build. ``fingerprints`` holds those of all of them, once it runs."""
 
     def __init__(
         self,
@@ -195,7 +201,13 @@ class _Builder:
 
     def run(self, until: str) -> SceneFolder:
         """Run the stages of the method up to ``until``; of a stage the method does not have, those before it."""
-        stages = self._stages(write_provenance(self.folder, self.capture, self.config))
+        sources, capture_hash = hash_capture(self.capture)
+        stages = self._stages(capture_hash)
+        for name, stage in stages.items():
+            self.fingerprints[name] = self._fingerprint(stage)
+        if not self._is_finished("reconstruct", stages["reconstruct"]):
+            refuse_to_lose_steps(self.folder)
+        write_provenance(self.folder, self.capture, self.config, sources)
         order = list(stages)
         wanted = order[: order.index(until if until in stages else "features") + 1]
         encodes = "features" in wanted and self.encoders is None
@@ -205,8 +217,16 @@ class _Builder:
             self.encoders = check_encoders(self.config, source, len(sizes), max(sizes), self.listener)
         if self.encoders is not None and self.config.features_from is not None:
             check_external_features(self.config.features_from, self.capture, self.encoders.clip.dim)
+        changes = not all(self._is_finished(name, stages[name]) for name in wanted)
         for name in wanted:
             self._run_stage(name, stages[name])
+        if changes and (self.folder.root / "metrics.json").exists():
+            log.warning(
+                "%s: metrics.json, report.html and heatmaps are of the scene before this build;"
+                " run: lexsplat evaluate %s",
+                self.folder.root,
+                quote(str(self.folder.root)),
+            )
         if until == "language":
             self.folder.record.pop("building", None)
             self.folder.save()
@@ -239,12 +259,12 @@ class _Builder:
         ])  # fmt: skip
 
     def _is_finished(self, name: str, stage: _Stage) -> bool:
-        return self.folder.is_finished(name, self._fingerprint(stage)) and all(
+        return self.folder.is_finished(name, self.fingerprints[name]) and all(
             path.exists() for path in stage.outputs
         )
 
     def _run_stage(self, name: str, stage: _Stage) -> None:
-        key = self.fingerprints[name] = self._fingerprint(stage)
+        key = self.fingerprints[name]
         if self._is_finished(name, stage):
             warn_again(self.folder.record["stages"][name])
             self.listener(Event(name, 1, 1, {"kept": 1.0}))
@@ -313,10 +333,7 @@ class _Builder:
         field.method = self.method.name
         metadata = {**field.metadata(), "reconstruction": self.fingerprints["reconstruct"]}
         write_tensors(self.folder.language_path, field.tensors(), metadata)
-        facts: dict[str, Any] = {"method": field.method, **field.facts()}
-        if field.segments is not None:
-            facts["segments"] = field.segments.levels.shape[1]
-        return facts
+        return {"method": field.method, **field.facts()}
 
     # -- what the stages share
 

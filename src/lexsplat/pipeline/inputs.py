@@ -44,6 +44,7 @@ from lexsplat.runtime.errors import CaptureError, SceneFolderError
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.progress import NOTE, Listener, kept_warnings, warn_again
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.unsaved import refuse_to_lose_steps
 
 log = logging.getLogger("lexsplat")
 
@@ -241,6 +242,7 @@ def _registered_images(
     if kept and folder.is_finished("poses", key):
         warn_again(folder.record["stages"]["poses"])
         return str(images)
+    refuse_to_lose_steps(folder)
     start = time.perf_counter()
     folder.reopen("poses")
     if is_video(source):

@@ -288,6 +288,7 @@ class Editor:
             record.get("edits_fingerprint"), [step.to_json() for step in self.steps]
         )
         record["stages"].get("reconstruct", {})["gaussians"] = len(self.scene.gaussians)
+        record["stages"].get("language", {}).update(self.scene.field.facts())
         stages, record["stages"] = record["stages"], {}
         folder.record = record
         output.mkdir(parents=True)

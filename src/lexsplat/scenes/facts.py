@@ -7,7 +7,7 @@ from typing import Any
 
 from lexsplat.geometry.world import world_of
 from lexsplat.scenes.folder import SceneFolder
-from lexsplat.scenes.unsaved import unsaved_steps
+from lexsplat.scenes.unsaved import outdated_steps, unsaved_steps
 
 NO_SEGMENTS = (
     "single Gaussians answer; lexsplat language CAPTURE --output SCENE, with the options of the build, adds segments"
@@ -63,7 +63,10 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),
         "language_bytes": folder.bytes_on_disk(folder.language_path),
         "code_map_bytes": folder.bytes_on_disk(folder.root / "codes"),
+        "edits": record.get("edits", []),
         "unsaved_steps": unsaved_steps(folder),
+        "outdated_steps": outdated_steps(folder),
+        "rebuilding": folder.content != folder.root,
         "warnings": len(record.get("warnings", [])),
         "lexsplat": record.get("provenance", {}).get("lexsplat"),
     }
