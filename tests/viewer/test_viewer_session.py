@@ -206,7 +206,8 @@ def test_a_step_for_one_of_several_places_says_so(session):
 @pytest.mark.parametrize(
     ("action", "values"),
     [("recolor", {"color": [2, 0, 0]}), ("move", {"scale": -1}), ("move", {"by": [float("nan"), 0, 0]}),
-     ("move", {"by": [1, 2]}), ("explode", {}), ("move", {"turn": "90"})],
+     ("move", {"by": [1, 2]}), ("explode", {}), ("move", {"turn": "90"}), ("move", {}),
+     ("move", {"by": [0, 0, 0], "turn": 0, "scale": 1}), ("duplicate", {})],
 )  # fmt: skip
 def test_edits_without_meaning_are_refused_and_change_nothing(session, action, values):
     with pytest.raises(QueryError):
@@ -335,3 +336,15 @@ def test_a_page_is_told_that_another_program_has_edited_the_scene(scene_and_ball
     assert client.get("/manifest.json").json()["server"]["version"] == 2
     refused = client.post("/objects", json={**asked, "version": 2})
     assert (refused.status_code, "discard the edit" in refused.text) == (400, True)
+
+
+def test_an_edit_with_a_misspelled_key_is_refused(session):
+    from starlette.testclient import TestClient
+
+    client = TestClient(make_app(session))
+    asked = {"version": 1, "prompt": "ball 1", "action": "move", "by": [0, 0, 1]}
+    refused = client.post("/edit", json={**asked, "scael": 2})
+    assert refused.status_code == 400
+    assert "found 'scael'" in refused.json()["error"]["message"]
+    assert session.editor.steps == []
+    assert client.post("/edit", json={**asked, "scale": 2}).status_code == 200

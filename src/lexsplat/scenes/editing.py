@@ -28,6 +28,7 @@ from lexsplat.queries.visibility import whole_things, with_remains
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
+from lexsplat.scenes.colors import parse_color
 from lexsplat.scenes.filling import Fill, fill_for
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
@@ -142,19 +143,37 @@ class Motion:
         translation: ``[3]``, world units. t is this and what keeps the bottom of the box at its height.
         rotation: R ``[3, 3]``, a proper rotation; None is the identity.
         scale: Factor on sizes, positive.
+
+    Raises:
+        ValueError: If the translation is not three numbers, or the rotation no ``[3, 3]``.
     """
 
     translation: Sequence[float] = (0.0, 0.0, 0.0)
     rotation: NDArray[np.float64] | None = None
     scale: float = 1.0
 
+    def __post_init__(self) -> None:
+        for name, shape in (("translation", (3,)), ("rotation", (3, 3))):
+            value = getattr(self, name)
+            if value is not None and np.shape(value) != shape:
+                raise ValueError(f"{name} must have the shape {shape}, got {value!r}"[:200])
+
     def values(self, chosen: Selection) -> dict[str, Any]:
-        """The numbers of a `Step` that moves ``chosen``."""
+        """The numbers of a `Step` that moves ``chosen``.
+
+        Raises:
+            QueryError: If nothing would move.
+        """
+        turn = np.eye(3) if self.rotation is None else self.rotation
+        if self.scale == 1 and not np.any(self.translation) and np.array_equal(turn, np.eye(3)):
+            raise QueryError(
+                "motion", expected="a translation, a rotation or a scale other than 1", found="none of them"
+            )
         center, lift = np.zeros(3), np.zeros(3)
         if chosen:
             center, lift = chosen.center, (self.scale - 1) * chosen.box.half_sizes[2] * chosen.up.direction
         vectors = {
-            "rotation": np.eye(3) if self.rotation is None else self.rotation,
+            "rotation": turn,
             "translation": np.asarray(self.translation, float) + lift,
             "center": center,
         }
@@ -220,8 +239,15 @@ class Editor:
         """Remove everything but a selection."""
         self._do("keep", chosen)
 
-    def recolor(self, chosen: Selection, color: Sequence[float], strength: float = 1.0) -> None:
-        """Give a selection another color, RGB in 0..1, with its old shading (`recolored`)."""
+    def recolor(self, chosen: Selection, color: Sequence[float] | str, strength: float = 1.0) -> None:
+        """Give a selection another color with its old shading (`recolored`).
+
+        Args:
+            chosen: The selection.
+            color: RGB in 0..1, "#ff8800" or a name such as "orange".
+            strength: See `recolored`.
+        """
+        color = parse_color([color]) if isinstance(color, str) else color
         self._do("recolor", chosen, color=[float(c) for c in color], strength=float(strength))
 
     def move(self, chosen: Selection, motion: Motion, fill: bool = True) -> None:
@@ -233,17 +259,19 @@ class Editor:
             fill: Close the surface under its things at their old places, as `delete` does.
 
         Raises:
+            QueryError: If nothing would move.
             ValueError: If the motion is invalid (see `lexsplat.scenes.transforms.transformed`).
         """
-        self._do("move", chosen, fill, **motion.values(chosen))
+        self._do("move", chosen, fill, motion)
 
     def duplicate(self, chosen: Selection, motion: Motion) -> None:
         """Add a copy of a selection, transformed as by `move`.
 
         Raises:
+            QueryError: If the copy would not be moved.
             ValueError: If the motion is invalid (see `lexsplat.scenes.transforms.transformed`).
         """
-        self._do("duplicate", chosen, **motion.values(chosen))
+        self._do("duplicate", chosen, False, motion)
 
     def undo(self) -> bool:
         """Undo the last step; False if there is none."""
@@ -262,13 +290,13 @@ class Editor:
             self._advance(self.undone.pop())
         return True
 
-    def save(self, output: Path) -> SceneFolder:
+    def save(self, output: str | Path) -> SceneFolder:
         """Write the edited scene into a new folder; its ``scene.json`` lists the steps.
 
         Raises:
             SceneFolderError: If the folder exists, or the scene was not opened from one.
         """
-        source = self.original.folder
+        source, output = self.original.folder, Path(output)
         if source is None:
             raise SceneFolderError(
                 output,
@@ -312,10 +340,17 @@ class Editor:
         extend = with_remains if kind == "delete" else whole_things
         return extend(chosen, self.scene.hidden, self.scene.field.segments).mask
 
-    def _do(self, kind: Kind, chosen: Selection, fill: bool = False, **values: Any) -> None:
+    def _do(
+        self, kind: Kind, chosen: Selection, fill: bool = False, motion: Motion | None = None, **values: Any
+    ) -> None:
+        if not isinstance(chosen, Selection):
+            raise TypeError(f"expected a Selection, such as editor.scene.find(...), got {chosen!r}"[:200])
+        if kind in ("move", "duplicate") and not isinstance(motion, Motion):
+            raise TypeError(f"expected a Motion, such as Motion(translation=(1, 0, 0)), got {motion!r}"[:200])
         if not chosen.is_of(self.scene.gaussians):
             raise ValueError(
-                "the selection was made before the last edit: select again in the scene of the editor"
+                "the selection is of another scene, or was made before the last edit: select again in the scene"
+                " of the editor"
             )
         if not chosen:
             raise QueryError(
@@ -324,6 +359,8 @@ class Editor:
                 found="nothing",
                 remedy="try other words or a lower threshold",
             )
+        if motion is not None:
+            values = motion.values(chosen)
         mask = self.planned_mask(kind, chosen)
         gone = self.planned_mask("delete", chosen) if kind in ("delete", "move") else mask
         if fill:

@@ -21,7 +21,7 @@ from lexsplat.pipeline.inputs import reload_capture
 from lexsplat.runtime.errors import BackendError, LexsplatError, QueryError
 from lexsplat.scenes.publishing.index import PAGE_FILES, folder_index, page_file
 from lexsplat.scenes.serving import error_document
-from lexsplat.viewer.requests import Asked, read_document
+from lexsplat.viewer.requests import ASKED, Asked, read_document, refuse_unknown
 from lexsplat.viewer.session import Session
 
 _TYPES = {"js": "text/javascript", "css": "text/css", "txt": "text/plain", "wasm": "application/wasm"}
@@ -94,6 +94,7 @@ def _download(session: Session, data: dict[str, Any]) -> Response:
 
 
 def _edit(session: Session, data: dict[str, Any]) -> Response:
+    refuse_unknown(data, ("version", "action", *ASKED, "color", "strength", "by", "turn", "scale"))
     return JSONResponse(session.edit(str(data.get("action")), Asked.from_json(data), data))
 
 
