@@ -10,7 +10,7 @@ import pytest
 from lexsplat.geometry.cameras import look_at
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.files import atomic_path
-from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.folder import SceneFolder, refuse_within_scene
 
 
 def test_a_stage_is_finished_only_for_the_same_inputs(tmp_path):
@@ -108,3 +108,14 @@ def test_a_working_directory_with_other_files_is_no_output(tmp_path, monkeypatch
     folder = SceneFolder(tmp_path / "elsewhere")
     folder.root.mkdir()
     folder.refuse_foreign_files()
+
+
+def test_nothing_else_is_written_into_a_scene(tmp_path):
+    SceneFolder(tmp_path / "scene").save()
+    refuse_within_scene(tmp_path / "page")
+    refuse_within_scene(tmp_path / "scene")  # a build goes on there
+    for path in (tmp_path / "scene" / "page", tmp_path / "scene" / "a" / "b"):
+        with pytest.raises(
+            SceneFolderError, match=rf"found one in the scene {tmp_path / 'scene'}; give a folder"
+        ):
+            refuse_within_scene(path)

@@ -30,7 +30,7 @@ from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.scenes.colors import parse_color
 from lexsplat.scenes.filling import Fill, fill_for
-from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.folder import SceneFolder, refuse_within_scene
 from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.journal import Journal, Kind, Step, packed, unpacked
 from lexsplat.scenes.kept import keep_for
@@ -294,7 +294,7 @@ class Editor:
         """Write the edited scene into a new folder; its ``scene.json`` lists the steps.
 
         Raises:
-            SceneFolderError: If the folder exists, or the scene was not opened from one.
+            SceneFolderError: If the folder exists or lies in a scene, or the scene was not opened from one.
         """
         source, output = self.original.folder, Path(output)
         if source is None:
@@ -309,6 +309,7 @@ class Editor:
             raise SceneFolderError(
                 output, expected="a new folder", found=found, remedy="give another --output"
             )
+        refuse_within_scene(output)
         folder = SceneFolder(output)
         record = json.loads(json.dumps(source.record))
         record["edits"] = [*record.get("edits", ()), *map(str, self.steps)]

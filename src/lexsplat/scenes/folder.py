@@ -147,7 +147,7 @@ class SceneFolder:
                 "demo",
                 expected="a scene folder of your own",
                 found="the bundled scene",
-                remedy="make your own copy of it with: lexsplat demo",
+                remedy="build a scene of the same photos with: lexsplat demo",
             )
 
     @property
@@ -391,6 +391,21 @@ def _pixel_data(content: bytes, size: tuple[int, int]) -> bytes:
             packed.append(content[place + 8 : place + 8 + length])
         place += 12 + length
     return zlib.decompressobj().decompress(b"".join(packed), size[1] * (size[0] + 1) + 1)
+
+
+def refuse_within_scene(path: Path) -> None:
+    """Refuse to write a page or another scene into a scene folder, whose files are those of one scene.
+
+    Raises:
+        SceneFolderError: If a folder above is a scene.
+    """
+    if above := next((each for each in path.absolute().parents if (each / "scene.json").is_file()), None):
+        raise SceneFolderError(
+            path,
+            expected="a place outside of scene folders",
+            found=f"one in the scene {above}",
+            remedy="give a folder beside it",
+        )
 
 
 def file_of(folder: SceneFolder | None, name: str) -> Path:
