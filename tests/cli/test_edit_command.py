@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -254,3 +255,11 @@ def test_a_damaged_journal_has_no_steps_to_note(tmp_path, content):
     folder = SceneFolder(tmp_path)
     (tmp_path / "edits.jsonl").write_bytes(content)
     assert unsaved_steps(folder) == 0
+
+
+def test_edits_are_saved_beside_a_scene_and_where_folders_can_be_made(with_a_step, capsys):
+    inside = str(with_a_step / "edited")
+    fails_in_one_line(capsys, ["edit", str(with_a_step), "save", "--output", inside], "one in the scene")
+    if Path("/proc/self").exists():
+        save = ["edit", str(with_a_step), "save", "--output", "/proc/edited"]
+        fails_in_one_line(capsys, save, "/proc/edited: No such file or directory; give another place")

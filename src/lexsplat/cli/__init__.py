@@ -57,7 +57,7 @@ COMMANDS = {
 
 _REMEDIES = {
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "; allow it, or give another place"),
-    **dict.fromkeys((errno.EEXIST, errno.ENOTDIR), "; give another place"),
+    **dict.fromkeys((errno.EEXIST, errno.ENOENT, errno.ENOTDIR), "; give another place"),
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "; free some space and run the same command again"),
 }
 """Remedies for errors of the system, by their numbers."""

@@ -51,7 +51,7 @@ class Asked:
         prompt, click, threshold = data.get("prompt") or "", data.get("click"), data.get("threshold")
         if not isinstance(prompt, str) or len(prompt) > MAX_LENGTH:
             found = f"{len(prompt)} characters" if isinstance(prompt, str) else type(prompt).__name__
-            raise QueryError("prompt", expected=f"at most {MAX_LENGTH} characters", found=found)
+            raise QueryError("prompt", expected=f"a text of at most {MAX_LENGTH} characters", found=found)
         camera = None if data.get("camera") is None else _camera(data["camera"])
         if click is not None and camera is None:
             raise QueryError("click", expected="a camera with it", found="none")
