@@ -65,6 +65,14 @@ def test_the_authors_folders_are_read_as_they_are(authors):
     np.testing.assert_array_equal(ground_truth, disk(20, 20, 8))
 
 
+def test_two_masks_of_one_prompt_in_one_view_are_refused(authors):
+    folder = authors / "segmentations" / "DSCF4670"
+    shutil.copy(folder / "silver gray curtain.png", folder / "silver_gray_curtain.png")
+    told = "DSCF4670: .* found silver gray curtain.png and silver_gray_curtain.png, which mean the same one"
+    with pytest.raises(CaptureError, match=told):
+        load_annotations(load_capture(authors))
+
+
 def test_masks_of_the_released_code_can_be_renamed_to_the_papers_prompts(authors):
     found = load_annotations(load_capture(authors)).renamed(prompt_names("room", "paper"))
     assert found.prompts() == ("curtain", "windows", "yucca plant")
@@ -222,6 +230,15 @@ def test_lerf_ovs_objects_of_one_name_are_one_mask_with_several_boxes(lerf_ovs):
     sheep[5:16, 10:21] = sheep[30:41, 40:51] = True  # corners truncated to whole pixels, edges included
     np.testing.assert_array_equal(found.masks[FRAMES[1]]["sheep"], sheep)
     np.testing.assert_array_equal(found.boxes[FRAMES[1]]["sheep"], [[10, 5, 21, 16], [50, 40, 40, 30]])
+
+
+def test_polygons_outside_the_photo_or_of_two_corners_are_masks_without_a_pixel(lerf_ovs):
+    path = lerf_ovs.parent / "label" / "teatime" / "frame_00005.json"
+    outside = [[x - 900, y] for x, y in SQUARE]
+    objects = [("apple", outside, [0, 0, 1, 1]), ("sheep", SQUARE[:2], [0, 0, 1, 1])]
+    path.write_text(json.dumps(label(FRAMES[4], objects)))
+    found = load_annotations(load_capture(lerf_ovs)).masks[FRAMES[4]]
+    assert [mask.any() for mask in found.values()] == [False, False]
 
 
 def test_lerf_ovs_masks_and_boxes_are_undistorted_with_their_photo(lerf_ovs):

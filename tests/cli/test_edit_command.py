@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -247,15 +248,18 @@ def test_info_counts_the_steps_that_the_scene_does_not_hold(with_a_step, capsys)
     assert json.loads(capsys.readouterr().out)["unsaved_steps"] == 1
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff\n", b"{}\n3\n", b'{}\n{"undo": true}\n', b"{}\n{\n"])
+@pytest.mark.parametrize(
+    "content", [b"", b"\xff\n", b"{}\n3\n", b'{}\n{"undo": true}\n', b"{}\n{\n", b"{}\n{}\n{}\n3\n"]
+)
 def test_a_damaged_journal_has_no_steps_to_note(tmp_path, content):
     folder = SceneFolder(tmp_path)
     (tmp_path / "edits.jsonl").write_bytes(content)
     assert unsaved_steps(folder) == 0
 
 
-@pytest.mark.parametrize("damage", ['{"step": "del', "[]", "{}{}"])
-def test_the_steps_before_a_damaged_line_are_noted(tmp_path, damage):
-    lines = ['{"journal": 1}', '{"step": "delete"}', '{"step": "move"}', damage, '{"step": "keep"}', ""]
-    (tmp_path / "edits.jsonl").write_text("\n".join(lines))
-    assert unsaved_steps(SceneFolder(tmp_path)) == 2
+def test_edits_are_saved_beside_a_scene_and_where_folders_can_be_made(with_a_step, capsys):
+    inside = str(with_a_step / "edited")
+    fails_in_one_line(capsys, ["edit", str(with_a_step), "save", "--output", inside], "one in the scene")
+    if Path("/proc/self").exists():
+        save = ["edit", str(with_a_step), "save", "--output", "/proc/edited"]
+        fails_in_one_line(capsys, save, "/proc/edited: No such file or directory; give another place")

@@ -6,11 +6,21 @@ import pytest
 from support.command_line import Terminal, fails_in_one_line
 
 from lexsplat import cli
+from lexsplat.scenes.folder import SceneFolder
 
 
 def test_a_page_that_would_be_a_folder_named_html_is_refused(tmp_path, capsys):
     target = tmp_path / "page.html"
     fails_in_one_line(capsys, ["publish", "demo", str(target)], "page.html", "--single-file")
+    assert not target.exists()
+
+
+def test_a_page_is_not_written_into_a_scene(tmp_path, capsys):
+    SceneFolder(tmp_path / "scene").save()
+    target = tmp_path / "scene" / "page"
+    fails_in_one_line(
+        capsys, ["publish", "demo", str(target)], f"one in the scene {tmp_path / 'scene'}", "beside it"
+    )
     assert not target.exists()
 
 

@@ -47,6 +47,8 @@ from lexsplat.pipeline.config import BuildConfig
         ["demo", "--iterations", "0"],
         ["demo", "--seed", "-1"],
         ["compare", "x", "--output", "y", "--seeds", "-1"],
+        ["compare", "x", "--output", "y", "--clip", "c", "--features-from", "f"],
+        ["publish", "x", "y", "--max-splats", "1"],
         ["edit", "x", "delete", "--select", "a", "--threshold", "nan"],
         ["edit", "x", "delete", "--select", "a", "--grow", "-1"],
         ["edit", "x", "delete", "--select", "a", "--shrink", "inf"],
@@ -71,6 +73,14 @@ def test_wrong_usage_has_status_2_and_no_traceback(arguments, capsys):
         cli.main(arguments)
     assert caught.value.code == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_features_of_another_program_name_the_methods_of_compare_that_cannot_use_them(capsys):
+    arguments = ["compare", "x", "--output", "y", "--clip", "c", "--features-from", "f"]
+    with pytest.raises(SystemExit):
+        cli.main([*arguments, "--methods", "averaged", "lerf", "3dovs", "dff"])
+    told = " ".join(capsys.readouterr().err.replace("│", "").split())
+    assert "lerf and 3dovs need several crop sizes: give --methods averaged dff" in told
 
 
 @pytest.mark.parametrize(

@@ -218,6 +218,8 @@ def test_lerf_finds_the_balls(balls, maps):
 
     data = TrainingData(balls.gaussians, balls.cameras, maps, levels)
     found = Lerf(LerfConfig(scales=2, neighbors=3)).fit(data, BaselineRun({}))
+    again = Lerf(LerfConfig(scales=2, neighbors=3)).fit(data, BaselineRun({}, seed=7))
+    assert torch.equal(found.features, again.features), "seeds have no effect, as docs/evaluation.md says"
     assert isinstance(found, Method)
     assert found.features.shape == (2, len(balls.gaussians), DIM)
     assert float(found.scales[0]) < float(found.scales[1])

@@ -201,6 +201,19 @@ def test_masks_of_training_views_do_not_count(capture, gaussians):
     assert evaluate(capture, subject, QUICK, ground_truth=drawn(masks)).language is None
 
 
+def test_masks_without_a_pixel_and_prompts_in_two_spellings_are_told(capture, gaussians, caplog):
+    masks = {
+        name: {"red apple": mask, "Red  apple": mask, "blue ball": np.zeros_like(mask)}
+        for name, prompts in larger_masks(capture, 1).items()
+        for mask in [prompts["red apple"]]
+    }
+    evaluate(capture, traced(capture, gaussians), QUICK, ground_truth=drawn(masks))
+    first = sorted(masks)[0]
+    assert f"{len(masks)} masks cover no pixel: 'blue ball' in {first}" in caplog.text
+    assert "'Red  apple' and 'red apple' differ only in case or spaces" in caplog.text
+    assert caplog.text.count("masks cover no pixel") == 1
+
+
 def test_without_masks_images_are_measured_alone(capture, gaussians):
     metrics = evaluate(capture, traced(capture, gaussians), QUICK, ground_truth=drawn({}))
     assert metrics.language is None

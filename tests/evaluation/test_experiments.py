@@ -13,7 +13,8 @@ from support.schemas import validated
 
 from lexsplat.evaluation.ablate import make_language, paper_evaluation
 from lexsplat.evaluation.experiments import Bench, Row
-from lexsplat.runtime.errors import CaptureError
+from lexsplat.runtime.errors import CaptureError, SceneFolderError
+from lexsplat.scenes.folder import SceneFolder
 
 pytestmark = pytest.mark.usefixtures("color_encoders")
 
@@ -103,3 +104,12 @@ def test_crop_sizes_of_features_of_another_program_are_refused(open_bench, tmp_p
     bench.config = replace(bench.config, features_from=tmp_path)
     with pytest.raises(CaptureError, match="several crop sizes"):
         bench.level_maps("view_01.png")
+
+
+def test_results_are_not_written_into_a_scene(tiny_capture, tmp_path):
+    SceneFolder(tmp_path / "scene").save()
+    with pytest.raises(
+        SceneFolderError, match="expected a folder of its own for all results, found a scene; give"
+    ):
+        Bench(tiny_capture, tmp_path / "scene", AVERAGED, paper_evaluation())
+    assert [path.name for path in (tmp_path / "scene").iterdir()] == ["scene.json"]

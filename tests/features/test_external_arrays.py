@@ -63,6 +63,9 @@ def test_segment_features_become_maps_and_levels_are_averaged(capture, tmp_path)
         (np.full((2, 2, 3), np.nan), "NaN"),
         (np.zeros((2, 2, 3), "U1"), "array of numbers"),
         (np.array([[["a", {}]]], dtype=object), "without pickled objects"),
+        (np.ones((3, 4, 3), np.uint8), "features as floating-point numbers, found uint8"),
+        (np.ones((3, 4, 3), np.int64), "features as floating-point numbers, found int64"),
+        (np.ones((1, 1, 3), np.float32), "expected a map of the photo, found one feature for all of it"),
     ],
 )
 def test_invalid_external_arrays_are_refused(array, message, capture, tmp_path):
@@ -95,3 +98,22 @@ def test_missing_and_mismatched_external_arrays_are_refused(capture, tmp_path):
     (folder / "left/0.npy").unlink()
     with pytest.raises(FileFormatError, match="integers from -1 to 3"):
         load_external_features(folder, capture)["left/0.png"]
+
+
+def test_a_text_in_place_of_an_array_is_refused_without_advice_to_load_pickles(capture, tmp_path):
+    folder = _external(
+        capture, tmp_path / "x", lambda path: path.with_name(f"{path.name}.npy").write_text("1 2 3")
+    )
+    with pytest.raises(FileFormatError, match="found another format") as refused:
+        load_external_features(folder, capture)["left/0.png"]
+    assert "allow_pickle" not in str(refused.value)
+
+
+def test_two_arrays_of_one_view_are_refused(capture, tmp_path):
+    def write(path):
+        np.save(f"{path}.npy", np.ones((3, 4, 3), np.float32))
+        np.save(f"{path}_f.npy", np.ones((1, 3), np.float32))
+        np.save(f"{path}_s.npy", np.zeros((3, 4), np.int32))
+
+    with pytest.raises(FileFormatError, match=r"one array of the view left/0, found 0\.npy and 0_f\.npy"):
+        load_external_features(_external(capture, tmp_path / "x", write), capture)

@@ -11,7 +11,7 @@ from support.written_captures import save, write_transforms
 
 from lexsplat.captures import load_capture
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.pipeline.provenance import model_identity, write_provenance
+from lexsplat.pipeline.provenance import hash_capture, model_identity, write_provenance
 from lexsplat.scenes.folder import SceneFolder
 
 
@@ -20,11 +20,11 @@ def test_a_model_folder_is_found_from_any_working_folder(tmp_path, monkeypatch):
     (tmp_path / "models" / "clip").mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
     folder, scene = SceneFolder(tmp_path / "out"), load_capture(tmp_path / "capture")
-    write_provenance(folder, scene, BuildConfig(clip="models/clip", dino="none"))
+    write_provenance(folder, scene, BuildConfig(clip="models/clip", dino="none"), hash_capture(scene)[0])
     recorded = json.loads((tmp_path / "out" / "scene.json").read_text())["config"]
     assert Path(recorded["clip"]) == tmp_path / "models" / "clip"
     assert recorded["dino"] == "none"
-    write_provenance(folder, scene, BuildConfig(clip="some/name", dino="bundled"))
+    write_provenance(folder, scene, BuildConfig(clip="some/name", dino="bundled"), hash_capture(scene)[0])
     recorded = json.loads((tmp_path / "out" / "scene.json").read_text())["config"]
     assert (recorded["clip"], recorded["dino"]) == ("some/name", "bundled")
 
@@ -72,31 +72,28 @@ def other_split(capture, folder):
 @pytest.mark.parametrize("change", [other_photo, other_camera, other_mask, other_split])
 def test_the_fingerprint_follows_photos_cameras_masks_and_split(tmp_path, change):
     write_transforms(tmp_path / "capture", ["a.png", "b.png", "c.png"])
-    capture, folder = load_capture(tmp_path / "capture", test_every=0), SceneFolder(tmp_path / "out")
-    before = write_provenance(folder, capture, BuildConfig())
-    assert write_provenance(folder, capture, BuildConfig(seed=3)) == before, (
-        "settings have fingerprints of their own"
-    )
-    assert write_provenance(folder, change(capture, tmp_path), BuildConfig()) != before
+    capture = load_capture(tmp_path / "capture", test_every=0)
+    before = hash_capture(capture)[1]
+    assert hash_capture(change(capture, tmp_path))[1] != before
 
 
 def test_a_changed_mask_changes_the_fingerprint(tmp_path):
     write_transforms(tmp_path / "capture", ["a.png", "b.png"])
-    folder, found = SceneFolder(tmp_path / "out"), []
+    found = []
     for value in (0.0, 1.0):
         capture = other_mask(load_capture(tmp_path / "capture"), tmp_path)
         save(tmp_path / "mask.png", np.full((48, 64, 3), value))
-        found.append(write_provenance(folder, capture, BuildConfig()))
+        found.append(hash_capture(capture)[1])
     assert found[0] != found[1]
 
 
 def test_the_record_names_the_capture_but_not_photos_that_were_prepared(tmp_path):
     write_transforms(tmp_path / "capture", ["a.png", "b.png"])
     folder, capture = SceneFolder(tmp_path / "out"), load_capture(tmp_path / "capture")
-    write_provenance(folder, capture, BuildConfig(seed=7))
+    write_provenance(folder, capture, BuildConfig(seed=7), hash_capture(capture)[0])
     assert folder.record["capture"] == str(tmp_path / "capture")
     assert folder.record["provenance"]["seed"] == 7
     assert set(folder.record["provenance"]["sources"]) == {"a.png", "b.png"}
     folder.record.update(images="photos", capture="what the user gave")
-    write_provenance(folder, capture, BuildConfig())
+    write_provenance(folder, capture, BuildConfig(), hash_capture(capture)[0])
     assert folder.record["capture"] == "what the user gave"

@@ -2,6 +2,8 @@
 
 import gzip
 import logging
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +13,13 @@ from support.splats import tame
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.pipeline.splats import existing_splats, splats_hash
+from lexsplat.pipeline.splats import existing_splats, splats_hash, with_filter_of_photos
 from lexsplat.pipeline.viewpoints import choosing
+from lexsplat.rendering import render
 from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.progress import NOTE
+from lexsplat.scenes.exporting import export_gaussians
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.formats.ply import write_ply
 from lexsplat.scenes.formats.reading import read_splats
 
@@ -84,3 +90,27 @@ def test_a_packed_file_is_to_be_unpacked(tmp_path, name):
     (tmp_path / name).write_bytes(gzip.compress(b"ply\nformat ascii 1.0\n"))
     with pytest.raises(FileFormatError, match="found gzip; unpack it first"):
         read_splats(tmp_path / name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("filtered", [True, False])
+def test_photos_tell_whether_splats_need_the_filter_that_their_format_cannot_name(tmp_path, caplog, filtered):
+    folder = SceneFolder(BUNDLED_SCENE)
+    original = replace(folder.read_gaussians(), antialiased=filtered)
+    with caplog.at_level(NOTE):
+        export_gaussians(original, tmp_path / "g.splat")
+        export_gaussians(original, tmp_path / "g.ply")
+    assert ("g.splat: .splat cannot say that the Gaussians need the mip filter" in caplog.text) == filtered
+    assert "g.ply" not in caplog.text
+    views = []
+    for stored in list(folder.read_cameras().values())[:2]:
+        camera = stored.camera.downscaled(2)
+        photo = render(original, camera, color=True).image.cpu().numpy()
+        views.append(SimpleNamespace(camera=camera, load_image=lambda size, photo=photo: photo))
+    caplog.clear()
+    with caplog.at_level(NOTE):
+        found = with_filter_of_photos(read_splats(tmp_path / "g.splat"), views, tmp_path / "g.splat")
+    assert found.antialiased == filtered
+    assert ("g.splat: read as trained with the mip filter" in caplog.text) == filtered
+    stated = replace(read_splats(tmp_path / "g.ply"), antialiased=not filtered)
+    assert with_filter_of_photos(stated, views, tmp_path / "g.ply") is stated, "the format says it"

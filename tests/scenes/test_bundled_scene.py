@@ -36,6 +36,13 @@ def test_its_record_has_the_present_names():
     assert read_record(json.loads(path.read_text()), path) == json.loads(path.read_text())
 
 
+def test_weights_sum_to_one_or_to_zero_where_no_photo_shows_a_gaussian(demo):
+    sums = demo.field.weights.sum(1)
+    unseen = sums == 0
+    assert int(unseen.sum()) == demo.field.unseen > 0
+    assert torch.allclose(sums[~unseen], torch.ones(1), atol=1e-3)
+
+
 def snapshot() -> dict[str, int]:
     return {str(path): path.stat().st_mtime_ns for path in BUNDLED_SCENE.rglob("*")}
 

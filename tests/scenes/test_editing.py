@@ -281,7 +281,7 @@ def test_a_saved_edit_is_a_scene(base, tmp_path):
     folder.finish("language", "g", 1.0)
     editor = Editor(open_scene(folder.root, device="cpu"), folder.root / "edits.jsonl")
     editor.delete(choose(editor, 0))
-    editor.save(tmp_path / "saved")
+    editor.save(str(tmp_path / "saved"))
     saved = open_scene(tmp_path / "saved", device="cpu")
     assert torch.equal(saved.gaussians.means, scene.gaussians.means[labels != 0])
     assert saved.field.codes[:, 0].tolist() == labels[labels != 0].tolist()

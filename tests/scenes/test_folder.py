@@ -10,7 +10,7 @@ import pytest
 from lexsplat.geometry.cameras import look_at
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
-from lexsplat.scenes.folder import SceneFolder, StoredView, view_named
+from lexsplat.scenes.folder import SceneFolder, StoredView, refuse_within_scene, view_named
 
 
 def test_a_stage_is_finished_only_for_the_same_inputs(tmp_path):
@@ -145,3 +145,14 @@ def test_a_view_is_named_with_or_without_its_folder_and_its_suffix(name, found):
 def test_a_folder_or_suffix_that_is_given_must_be_that_of_the_view(name, views, found):
     with pytest.raises(QueryError, match=f"found {found}; the scene has {len(views)} views, such as "):
         view_named(views_of(*views), name)
+
+
+def test_nothing_else_is_written_into_a_scene(tmp_path):
+    SceneFolder(tmp_path / "scene").save()
+    refuse_within_scene(tmp_path / "page")
+    refuse_within_scene(tmp_path / "scene")  # a build goes on there
+    for path in (tmp_path / "scene" / "page", tmp_path / "scene" / "a" / "b"):
+        with pytest.raises(
+            SceneFolderError, match=rf"found one in the scene {tmp_path / 'scene'}; give a folder"
+        ):
+            refuse_within_scene(path)

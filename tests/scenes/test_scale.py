@@ -131,7 +131,8 @@ def test_invalid_up_and_scale_are_refused(old_demo_copy, capsys):
     assert run("scale", old_demo_copy, "--distance", 1, "--points", "1,1,1", "1,1,1") == 1
     assert "expected a positive distance, found 0" in capsys.readouterr().err
     assert run("scale", "demo", "--distance", 1, "--points", "1,1,1", "1,1,0") == 1
-    assert "found the bundled scene" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "found the bundled scene; build a scene of the same photos with: lexsplat demo" in told
 
 
 def test_a_scale_out_of_all_bounds_is_a_mistyped_distance(old_demo_copy, capsys):

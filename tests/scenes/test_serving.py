@@ -15,7 +15,16 @@ from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.answers import answer_queries, find_phrase
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.scene import open_scene
-from lexsplat.scenes.serving import MAX_LINE, OpenScene, answer_line, json_line, lines_of, open_scenes
+from lexsplat.scenes.serving import (
+    MAX_LINE,
+    OpenScene,
+    answer_line,
+    json_line,
+    lines_of,
+    open_scenes,
+    sentence,
+    worded,
+)
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "schemas" / "ask.json").read_text())
 
@@ -225,6 +234,22 @@ def test_a_thing_or_kind_in_a_color_is_the_objects_that_the_list_has_in_this_col
     answer = answer_line(served_demo, phrase)
     assert answer["understood"] == understood
     assert {thing["name"] for thing in answer["instances"]} == names
+
+
+@pytest.mark.parametrize(
+    ("understood", "told"),
+    [
+        ("(red any object)", "anything red"),
+        ('((dark blue any object) left of "mug")', '(anything dark blue left of "mug")'),
+        ('(any object on "cloth")', '(any object on "cloth")'),
+        ('"red any object"', '"red any object"'),
+    ],
+)
+def test_a_sentence_says_anything_red_where_the_parsed_phrase_says_red_any_object(understood, told):
+    assert worded(understood) == told
+    assert (
+        sentence({"understood": understood, "present": "no", "note": ""}) == f"Not here: nothing fits {told}."
+    )
 
 
 @pytest.mark.parametrize(

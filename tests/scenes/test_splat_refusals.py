@@ -11,6 +11,7 @@ import torch
 from support.refusals import refused
 from support.splats import tame
 
+from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.compressed import write_compressed
 from lexsplat.scenes.formats.ply import write_ply
 from lexsplat.scenes.formats.reading import read_splats
@@ -49,6 +50,26 @@ def test_spz_4_reports_where_its_table_cannot_begin(tmp_path):
         told = refused(tmp_path / "g.spz", changed, f"a table of contents at byte {start}, within the header")
         assert "streams" not in told
     refused(tmp_path / "g.spz", content[:15] + bytes([5]) + content[16:], "5 streams instead of 6")
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_no_flipped_bit_in_the_data_of_an_spz_changes_what_is_read(tmp_path, version):
+    path = tmp_path / "g.spz"
+    write_spz(tame(20, 1), path, version=version)
+    content, written = path.read_bytes(), read_splats(path).tensors()
+    data = 32 + 16 * 6 if version == 4 else 10  # after the header and the table of contents, or gzip's header
+    refusals = 0
+    for place in range(data, len(content)):
+        changed = bytearray(content)
+        changed[place] ^= 16
+        path.write_bytes(changed)
+        try:
+            found = read_splats(path).tensors()
+        except FileFormatError:
+            refusals += 1
+        else:  # bits that mean nothing, such as one in the header of a zstd frame
+            assert all(torch.equal(found[name], tensor) for name, tensor in written.items()), place
+    assert refusals > 0.98 * (len(content) - data)
 
 
 def with_axes(path: Path, version: int, number: int) -> bytes:

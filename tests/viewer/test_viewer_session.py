@@ -2,7 +2,9 @@
 
 import io
 import json
+import shutil
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +15,13 @@ from support.viewer_scene import WORDS, ball_scene
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.journal import Journal
+from lexsplat.scenes.scene import open_scene
 from lexsplat.viewer.app import make_app
 from lexsplat.viewer.history import History
 from lexsplat.viewer.requests import Asked
 from lexsplat.viewer.session import Session
+
+OLD = Path(__file__).parents[1] / "data" / "scene_d4e65b3" / "averaged"
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +211,8 @@ def test_a_step_for_one_of_several_places_says_so(session):
 @pytest.mark.parametrize(
     ("action", "values"),
     [("recolor", {"color": [2, 0, 0]}), ("move", {"scale": -1}), ("move", {"by": [float("nan"), 0, 0]}),
-     ("move", {"by": [1, 2]}), ("explode", {}), ("move", {"turn": "90"})],
+     ("move", {"by": [1, 2]}), ("explode", {}), ("move", {"turn": "90"}), ("move", {}),
+     ("move", {"by": [0, 0, 0], "turn": 0, "scale": 1}), ("duplicate", {})],
 )  # fmt: skip
 def test_edits_without_meaning_are_refused_and_change_nothing(session, action, values):
     with pytest.raises(QueryError):
@@ -335,3 +341,30 @@ def test_a_page_is_told_that_another_program_has_edited_the_scene(scene_and_ball
     assert client.get("/manifest.json").json()["server"]["version"] == 2
     refused = client.post("/objects", json={**asked, "version": 2})
     assert (refused.status_code, "discard the edit" in refused.text) == (400, True)
+
+
+def test_an_edit_with_a_misspelled_key_is_refused(session):
+    from starlette.testclient import TestClient
+
+    client = TestClient(make_app(session))
+    asked = {"version": 1, "prompt": "ball 1", "action": "move", "by": [0, 0, 1]}
+    refused = client.post("/edit", json={**asked, "scael": 2})
+    assert refused.status_code == 400
+    assert "found 'scael'" in refused.json()["error"]["message"]
+    assert session.editor.steps == []
+    assert client.post("/edit", json={**asked, "scale": 2}).status_code == 200
+
+
+def test_photos_that_are_gone_are_reported_without_options_that_the_viewer_lacks(tmp_path):
+    from starlette.testclient import TestClient
+
+    folder = shutil.copytree(OLD, tmp_path / "scene")
+    client = TestClient(make_app(Session(open_scene(folder, device="cpu"), 1_000_000, History())))
+    refused = client.get("/photo/0")
+    assert refused.status_code == 404
+    assert refused.json()["error"]["remedy"] == "put the photos back where the build found them"
+
+
+def test_a_prompt_that_is_no_text_is_told_so():
+    with pytest.raises(QueryError, match="expected a text of at most 120 characters, found int"):
+        Asked.from_json({"prompt": 5})

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 
 import tyro
 
-from lexsplat.cli.options import Device, SceneArgument, note_hidden_demo, note_unsaved
+from lexsplat.cli.options import Device, SceneArgument, note_hidden_demo, note_version
 from lexsplat.cli.waiting import LateProgress, starting
 
 Phrases = tyro.conf.Positional[Annotated[tuple[str, ...], tyro.conf.arg(metavar="PHRASE ...")]]
@@ -54,7 +54,7 @@ class Ask:
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
         served = OpenScene(self.scene, self.device, self.clip, LateProgress())
         if served.scene.folder is not None:
-            note_unsaved(served.scene.folder, self.scene)
+            note_version(served.scene.folder, self.scene)
         for phrase in self.phrases:
             print(sentence(find_phrase(served.scene, phrase)))
         if not self.stdin:

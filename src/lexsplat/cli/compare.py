@@ -59,7 +59,9 @@ class Compare:
     def check(self) -> None:
         """Refuse invalid options."""
         check_seeds(self.seeds)
-        ComparisonPlan(self.methods, self.seeds)
+        plan = ComparisonPlan(self.methods, self.seeds)
+        if self.settings.features_from is not None:
+            plan.refuse_without_crop_sizes()
 
     def run(self) -> None:
         """Measure and print the table."""

@@ -64,9 +64,9 @@ class Find:
 
 
 def _print_answer(answer: dict[str, Any]) -> None:
-    from lexsplat.scenes.serving import seen_in, shortened
+    from lexsplat.scenes.serving import seen_in, shortened, worded
 
-    understood = f" (understood as {shortened(answer['understood'])})"
+    understood = f" (understood as {worded(answer['understood'])})"
     note = f"; {answer['note']}" if answer["note"] else ""
     phrase = shortened(answer["phrase"], 60)
     print(f"{phrase}: present: {answer['present']}, {answer['count']} found{understood}{note}")

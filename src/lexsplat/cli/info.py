@@ -24,7 +24,8 @@ class Info:
         """Print the facts."""
         with starting():
             from lexsplat.scenes.facts import NO_SEGMENTS, scene_facts
-            from lexsplat.scenes.unsaved import saving
+            from lexsplat.scenes.previous import REBUILD
+            from lexsplat.scenes.unsaved import discarding, saving
 
         facts = scene_facts(open_folder(self.scene, shows_steps=True))
         if self.json:
@@ -32,8 +33,14 @@ class Info:
             return
         if facts["method"] is not None and facts["segments"] is None:
             facts["segments"] = f"none: {NO_SEGMENTS}"
+        if edits := facts.pop("edits"):
+            facts["edits"] = "; ".join(edits)
         if count := facts.pop("unsaved_steps"):
             facts["unsaved_steps"] = f"{count:,}; {saving(self.scene, count)}"
+        if count := facts.pop("outdated_steps"):
+            facts["outdated_steps"] = f"{count:,}, which {discarding(self.scene, count)}"
+        if facts.pop("rebuilding"):
+            facts["rebuild"] = f"{REBUILD}; these are facts of the scene before it"
         chosen = facts.pop("chosen_views")
         if chosen is not None:
             facts["capture"] = (

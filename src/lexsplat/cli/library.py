@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from lexsplat.cli.options import Device, check_phrases, note_unsaved, print_json
+from lexsplat.cli.options import Device, check_phrases, note_version, print_json
 from lexsplat.cli.waiting import LateProgress, starting
 from lexsplat.runtime.errors import FileFormatError, LibraryError, ModelError, SceneFolderError
 from lexsplat.runtime.progress import Event
@@ -143,7 +143,7 @@ class LibraryCommand:
                 continue
             records.append(dataclasses.asdict(record))
             self._say(f"{record.name}: added from {record.path}, {record.codes} codes of {record.clip}")
-            note_unsaved(SceneFolder.open(Path(path)), path)
+            note_version(SceneFolder.open(Path(path)), path)
         library.listener(Event("scenes", len(self.words), len(self.words)))
         return {"scenes": records, "failed": failed}
 
@@ -196,7 +196,7 @@ class LibraryCommand:
                     with contextlib.suppress(
                         SceneFolderError, FileFormatError
                     ):  # the index answers without it
-                        note_unsaved(SceneFolder.open(Path(hit.path)), hit.path)
+                        note_version(SceneFolder.open(Path(hit.path)), hit.path)
             if str(self.thumbnails) != "none":
                 self._write_thumbnails(found, answers[-1]["hits"])
         return {"phrases": answers}

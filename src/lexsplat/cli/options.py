@@ -59,7 +59,7 @@ def open_scene(path: str, device: str, clip: str | None, shows_steps: bool = Fal
         scene = search.open_scene(path, device=device, clip=clip)
     scene.listener = listener
     if scene.folder is not None and not shows_steps:
-        note_unsaved(scene.folder, path)
+        note_version(scene.folder, path)
     return scene
 
 
@@ -68,18 +68,19 @@ def open_folder(path: str, shows_steps: bool = False) -> SceneFolder:
     note_hidden_demo(path)
     with starting():
         from lexsplat.scenes.folder import SceneFolder
+        from lexsplat.scenes.previous import version_that_answers
 
-    folder = SceneFolder.open(Path(path))
+    folder = version_that_answers(SceneFolder.open(Path(path)))
     if not shows_steps:
-        note_unsaved(folder, path)
+        note_version(folder, path)
     return folder
 
 
-def note_unsaved(folder: SceneFolder, given: str) -> None:
-    """State on standard error that steps of an edit are not in the scene that a command reads."""
-    from lexsplat.scenes.facts import unsaved_note
+def note_version(folder: SceneFolder, given: str) -> None:
+    """State on standard error what the scene that a command reads does not hold: a rebuild, or steps of an edit."""
+    from lexsplat.scenes.facts import version_notes
 
-    if note := unsaved_note(folder, given):
+    for note in version_notes(folder, given):
         print(f"note: {note}", file=sys.stderr)
 
 

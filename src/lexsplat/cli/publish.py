@@ -59,11 +59,12 @@ class Publish:
     def check(self) -> None:
         """Refuse invalid options."""
         if self.max_splats is not None and self.max_splats < 2:
-            raise ValueError(f"max_splats must be at least 2, got {self.max_splats}")
+            raise ValueError(f"--max-splats must be at least 2, got {self.max_splats}")
 
     def run(self) -> None:
         """Write the page."""
         with starting():
+            from lexsplat.scenes.folder import refuse_within_scene
             from lexsplat.scenes.publishing import PublishOptions, check_target, publish
 
         if (
@@ -77,7 +78,8 @@ class Publish:
                 found="the name of a page",
                 remedy="give --single-file as well",
             )
-        check_target(self.folder, self.single_file)  # before anything is loaded
+        refuse_within_scene(self.folder)  # before anything is loaded
+        check_target(self.folder, self.single_file)
         options = PublishOptions(
             self.title,
             self.description,

@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 from tyro.constructors import PrimitiveConstructorSpec
 
+from lexsplat.scenes.colors import parse_color
+
 METERS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 """Meters in each unit of length that is accepted."""
 
@@ -24,25 +26,6 @@ def parse_length(text: str) -> float:
     except (ValueError, KeyError):
         units = ", ".join(METERS)
         raise ValueError(f"expected a length such as 0.095 or 9.5cm ({units}), found {text!r}") from None
-
-
-def parse_color(words: list[str]) -> tuple[float, float, float]:
-    """Red, green and blue in 0..1 of three numbers, of "#ff8800" or of a name of CSS such as "orange".
-
-    Raises:
-        ValueError: If it is none of them.
-    """
-    from PIL import ImageColor
-
-    try:
-        if len(words) == 1:
-            red, green, blue = (value / 255 for value in ImageColor.getrgb(words[0]))
-        else:
-            red, green, blue = map(float, words)
-    except ValueError:  # also of four values: there is no transparency
-        expected = 'three numbers in 0..1, a color such as "#ff8800" or a name such as orange'
-        raise ValueError(f"expected {expected}, found {' '.join(words)!r}") from None
-    return red, green, blue
 
 
 def _is_none_or(kind: type) -> Any:

@@ -39,6 +39,22 @@ class ComparisonPlan:
             raise ValueError(f"methods are {', '.join(COMPARED)}; got {', '.join(unknown) or 'too few'}")
         require_each_once(methods=self.methods, seeds=self.seeds)
 
+    def refuse_without_crop_sizes(self) -> None:
+        """Refuse methods that cannot use features of another program, before anything that takes time.
+
+        Raises:
+            ValueError: If a method needs features of several crop sizes.
+        """
+        others = [
+            name for name in self.methods if name not in BASELINES or not BASELINES[name].needs_crop_sizes
+        ]
+        unfit = [name for name in self.methods if name not in others]
+        if unfit:
+            way = f"give --methods {' '.join(others)}" if others else "give other --methods"
+            raise ValueError(
+                f"--features-from has one feature a pixel, and {' and '.join(unfit)} need several crop sizes: {way}"
+            )
+
 
 def compare(bench: Bench, plan: ComparisonPlan | None = None) -> list[dict[str, Any]]:
     """Measure the methods; writes ``comparison.json``, ``.csv``, ``.tex`` and ``.html`` (`Bench.measure`).

@@ -46,7 +46,7 @@ from lexsplat.pipeline.inputs import preview_capture, reload_capture
 from lexsplat.queries.relevancy import QueryConfig, QueryForm
 from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.environment import code_identity, machine_facts
-from lexsplat.runtime.errors import CaptureError, FileFormatError
+from lexsplat.runtime.errors import CaptureError, FileFormatError, SceneFolderError
 from lexsplat.runtime.files import read_json, read_tensors, to_json, write_json, write_tensors
 from lexsplat.runtime.fingerprints import file_hash, fingerprint
 from lexsplat.runtime.progress import Listener, silent
@@ -120,6 +120,7 @@ class Bench:
 
     Raises:
         CaptureError: If there is no ground truth of held-out views, or no prompt list for the capture.
+        SceneFolderError: If the output folder is a scene.
     """
 
     def __init__(
@@ -132,6 +133,13 @@ class Bench:
         listener: Listener = silent,
     ) -> None:
         self.origin = ground_truth or GroundTruthSource()
+        if (output / "scene.json").exists():
+            raise SceneFolderError(
+                output,
+                expected="a folder of its own for all results",
+                found="a scene",
+                remedy="give another --output",
+            )
         check_ground_truth_options(source, self.origin.masks, self.origin.prompt_list)
         self.output, self.listener, self.evaluation = output, listener, evaluation
         self.as_in_paper = config.as_in_paper  # all rows share one geometry, so none is trained jointly
@@ -169,7 +177,7 @@ class Bench:
                 self.config.features_from,
                 expected="features of several crop sizes, which this method needs",
                 found="one feature a pixel",
-                remedy="leave --features-from out, or the method (lerf) with --methods",
+                remedy="leave --features-from out, or the method with --methods",
             )
         return load_level_maps(
             self.capture, self._encoders.clip, self.config.features, self.folder.features_path, name

@@ -22,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from lexsplat.captures.ground_truth.layouts import Annotations, load_annotations, load_ground_truth
+from lexsplat.evaluation.ground_truth import warn_of_odd_masks
 from lexsplat.evaluation.memory import peak_gpu_memory, peak_memory
 from lexsplat.evaluation.methods import MethodScene
 from lexsplat.evaluation.metrics import (
@@ -144,6 +145,7 @@ class _Evaluation:
         masks, self.boxes = ground_truth.masks, ground_truth.boxes
         self.views: list[View] = [capture.views[name] for name in capture.test_names]
         self.masks = {view.name: masks[view.name] for view in self.views if masks.get(view.name)}
+        warn_of_odd_masks(ground_truth, self.views)
         self.prompts = sorted({prompt for prompts in self.masks.values() for prompt in prompts})
         self.selected: dict[str, Gaussians] = {}
         self.thresholds: dict[str, dict[str, float]] = {}

@@ -98,7 +98,7 @@ def check_external_features(folder: Path, capture: Capture, dimension: int | Non
             of_segments, _ = reading.open_segments(path)
             _check_depth(of_segments.shape[1], dimension, path)
         elif path.suffix == ".npy":
-            shape = open_npy(path).shape
+            shape = _open_features(path).shape
             reading.check_aspect(shape, path)
             _check_depth(shape[-1], dimension, path)
 
@@ -113,7 +113,7 @@ def external_sources(folder: Path, capture: Capture) -> dict[str, Path]:
     """The file of each view by its name; of a pair, the file of features.
 
     Raises:
-        FileFormatError: If there is no folder, a view has no file, or one of a pair is missing.
+        FileFormatError: If there is no folder, a view has no file or two, or one of a pair is missing.
     """
     if not folder.is_dir():
         raise wrong(folder, "a folder with one array per view", "no folder", "check the path")
@@ -137,12 +137,15 @@ def _segments_of(path: Path) -> Path:
 
 def _source(folder: Path, stem: str) -> Path:
     candidates = [folder / f"{stem}{ending}" for ending in (".npy", ".safetensors", "_f.npy")]
-    for path in candidates:
-        if path.is_file():
-            if path.name.endswith("_f.npy") and not _segments_of(path).is_file():
-                remedy = "put the segments of every pixel beside their features"
-                raise wrong(_segments_of(path), f"the segments of {path.name}", "no such file", remedy)
-            return path
+    there = [path for path in candidates if path.is_file()]
+    if len(there) > 1:
+        found = " and ".join(path.name for path in there)
+        raise wrong(folder, f"one array of the view {stem}", found, "remove those that are not meant")
+    for path in there:
+        if path.name.endswith("_f.npy") and not _segments_of(path).is_file():
+            remedy = "put the segments of every pixel beside their features"
+            raise wrong(_segments_of(path), f"the segments of {path.name}", "no such file", remedy)
+        return path
     for ending in PICKLES:
         if (folder / f"{stem}{ending}").exists():
             refuse_pickle(folder / f"{stem}{ending}")
@@ -165,7 +168,7 @@ class _Reading:
     def arrays(self, path: Path) -> FeatureMap:
         """``[h, w, D]`` from .npy or safetensors."""
         if path.suffix == ".npy":
-            array = open_npy(path)
+            array = _open_features(path)
             itemsize = 0 if array.dtype == np.float32 else array.itemsize
             rows, columns = self._cells(array.shape, itemsize, path)
             return FeatureMap(_unit(array[rows[:, None], columns], path))
@@ -209,7 +212,7 @@ class _Reading:
 
     def open_segments(self, path: Path) -> tuple[NDArray, NDArray]:
         """Features of segments ``[n, D]``, and the segments of the pixels ``[h, w]`` or ``[L, h, w]``, mapped."""
-        features, pixels = open_npy(path), _segments_of(path)
+        features, pixels = _open_features(path), _segments_of(path)
         if features.ndim != 2 or 0 in features.shape:
             raise wrong(path, "features of segments [n, D]", list(features.shape))
         numbers = open_npy(pixels)
@@ -223,6 +226,8 @@ class _Reading:
         if len(shape) != 3 or 0 in shape:
             raise wrong(path, "features [h, w, D]", list(shape))
         height, width, _ = shape
+        if height == width == 1:
+            raise wrong(path, "a map of the photo", "one feature for all of it", "give features of its parts")
         photo_width, photo_height = self.view.capture_size
         # Numbers of cells are rounded: either side may be off by one.
         if abs(height * photo_width - width * photo_height) >= photo_width + photo_height:
@@ -275,9 +280,19 @@ def open_npy(path: Path) -> NDArray:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except _UNREADABLE as error:
-        raise wrong(path, "a .npy array without pickled objects", error) from error
+        # numpy takes other formats for pickles, and advises to allow them.
+        found = "another format, or pickled objects" if "pickle" in str(error) else error
+        raise wrong(path, "a .npy array without pickled objects", found) from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         raise wrong(path, "an array of numbers", getattr(array, "dtype", type(array)))
+    return array
+
+
+def _open_features(path: Path) -> NDArray:
+    """As `open_npy`, of floating-point numbers: integers are quantized with unknown steps, or segment ids."""
+    array = open_npy(path)
+    if array.dtype.kind != "f":
+        raise wrong(path, "features as floating-point numbers", array.dtype)
     return array
 
 

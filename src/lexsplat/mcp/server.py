@@ -27,7 +27,7 @@ from lexsplat.mcp.lines import messages
 from lexsplat.mcp.tools import LibraryTools, Reply, Tools
 from lexsplat.mcp.writing import WritingTools
 from lexsplat.runtime.errors import LexsplatError, QueryError
-from lexsplat.scenes.facts import unsaved_note
+from lexsplat.scenes.facts import version_notes
 from lexsplat.scenes.library import Library
 from lexsplat.scenes.serving import OpenScene, error_document
 
@@ -219,7 +219,8 @@ def _tool(tools: Tools, name: str) -> Callable[..., CallToolResult]:
             place = tools._scene(arguments.get("scene", "")) if "scene" in hints.parameters else None
         except LexsplatError as error:
             return _refusal(error)
-        note = unsaved_note(place.folder) if place is not None else ""
+        folder = place.folder if place is not None else None
+        note = "; ".join(version_notes(folder)) if folder is not None else ""
         content: list[Any] = [TextContent(text=f"{reply.sentence} Note: {note}." if note else reply.sentence)]
         if reply.image is not None:
             import base64

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from lexsplat.captures import Capture, View, load_annotations
@@ -34,6 +35,7 @@ from lexsplat.pipeline.inputs import (
 )
 from lexsplat.pipeline.provenance import (
     features_identity,
+    hash_capture,
     model_place,
     record_warnings,
     with_full_paths,
@@ -61,6 +63,7 @@ from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.foreign import warnings_once
 from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.previous import drop_previous
+from lexsplat.scenes.unsaved import refuse_to_lose_steps
 
 log = logging.getLogger("lexsplat")
 
@@ -109,6 +112,7 @@ def build(
         refuse_output_in_capture(source, Path(output))
     folder = SceneFolder(Path(output))
     folder.refuse_foreign_files()
+    folder.refuse_edited()
     is_new = not folder.root.exists()
     above = [place for place in folder.root.absolute().parents if not place.exists()]
     given = (source,) if source is not None and source.is_dir() else ()  # of a video workers get the frames
@@ -176,7 +180,7 @@ class _Stage:
 
 
 class _Builder:
-    """The stages of one build. ``fingerprints`` holds those of the stages done so far."""
+    """The stages of one build. ``fingerprints`` holds those of all of them, once it runs."""
 
     def __init__(
         self,
@@ -200,7 +204,13 @@ class _Builder:
 
     def run(self, until: str) -> SceneFolder:
         """Run the stages of the method up to ``until``; of a stage the method does not have, those before it."""
-        stages = self._stages(write_provenance(self.folder, self.capture, self.config))
+        sources, capture_hash = hash_capture(self.capture)
+        stages = self._stages(capture_hash)
+        for name, stage in stages.items():
+            self.fingerprints[name] = self._fingerprint(stage)
+        if not self._is_finished("reconstruct", stages["reconstruct"]):
+            refuse_to_lose_steps(self.folder)
+        write_provenance(self.folder, self.capture, self.config, sources)
         order = list(stages)
         wanted = order[: order.index(until if until in stages else "features") + 1]
         encodes = "features" in wanted and self.encoders is None
@@ -210,8 +220,16 @@ class _Builder:
             self.encoders = check_encoders(self.config, source, len(sizes), max(sizes), self.listener)
         if self.encoders is not None and self.config.features_from is not None:
             check_external_features(self.config.features_from, self.capture, self.encoders.clip.dim)
+        changes = not all(self._is_finished(name, stages[name]) for name in wanted)
         for name in wanted:
             self._run_stage(name, stages[name])
+        if changes and (self.folder.root / "metrics.json").exists():
+            log.warning(
+                "%s: metrics.json, report.html and heatmaps are of the scene before this build;"
+                " run: lexsplat evaluate %s",
+                self.folder.root,
+                quote(str(self.folder.root)),
+            )
         if until == "language":
             self.folder.record.pop("building", None)
             self.folder.save()
@@ -245,7 +263,7 @@ class _Builder:
 
     def _is_finished(self, name: str, stage: _Stage) -> bool:
         """Whether the files of a stage are those that a build with these inputs makes, and whole."""
-        if not self.folder.is_finished(name, self._fingerprint(stage)):
+        if not self.folder.is_finished(name, self.fingerprints[name]):
             return False
         if not all(path.exists() for path in stage.outputs):
             return False
@@ -258,7 +276,7 @@ class _Builder:
         return True
 
     def _run_stage(self, name: str, stage: _Stage) -> None:
-        key = self.fingerprints[name] = self._fingerprint(stage)
+        key = self.fingerprints[name]
         if self._is_finished(name, stage):
             done = self.folder.record["stages"]
             done[name] = done.pop(name)  # in the order of the stages, whichever ran before
@@ -347,10 +365,7 @@ class _Builder:
         field.method = self.method.name
         metadata = {**field.metadata(), "reconstruction": self.fingerprints["reconstruct"]}
         write_tensors(self.folder.language_path, field.tensors(), metadata)
-        facts: dict[str, Any] = {"method": field.method, **field.facts()}
-        if field.segments is not None:
-            facts["segments"] = field.segments.levels.shape[1]
-        return facts
+        return {"method": field.method, **field.facts()}
 
     # -- what the stages share
 

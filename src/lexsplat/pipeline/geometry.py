@@ -17,7 +17,7 @@ from lexsplat.geometry.world import World, parse_vector
 from lexsplat.language.methods import JOINT_METHODS, FitRun, JointMethod, TrainingViews
 from lexsplat.language.methods.joint import JointTrainer
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.pipeline.splats import check_agreement, existing_splats, splats_hash
+from lexsplat.pipeline.splats import check_agreement, existing_splats, splats_hash, with_filter_of_photos
 from lexsplat.pipeline.viewpoints import splats_of_capture
 from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct, tell_time
 from lexsplat.reconstruction.block_training import BlockRun, reconstruct_blocks
@@ -149,7 +149,10 @@ class _Given(Geometry):
         splats = existing_splats(self.path)
         with uncounted(run.fit.listener, "splats"):
             gaussians = splats_of_capture(splats, run.capture, run.folder)
-            check_agreement(gaussians, list(run.capture.train_views), splats)
+            views = list(run.capture.train_views)
+            check_agreement(gaussians, views, splats)
+            if run.capture.root != run.folder.root / "poses":  # chosen views have no photos
+                gaussians = with_filter_of_photos(gaussians, views, splats)
         return gaussians, {"splats": str(splats.resolve())}
 
 

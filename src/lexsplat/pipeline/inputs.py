@@ -46,6 +46,7 @@ from lexsplat.runtime.errors import CaptureError, SceneFolderError
 from lexsplat.runtime.fingerprints import file_sample, fingerprint
 from lexsplat.runtime.progress import NOTE, Listener, kept_warnings, warn_again
 from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.unsaved import refuse_to_lose_steps
 
 log = logging.getLogger("lexsplat")
 
@@ -258,6 +259,7 @@ def _registered_images(
     if kept and folder.is_finished("poses", key):
         warn_again(folder.record["stages"]["poses"])
         return str(images)
+    refuse_to_lose_steps(folder)
     start = time.perf_counter()
     folder.reopen("poses")
     if is_video(source):

@@ -29,14 +29,27 @@ from lexsplat.scenes.previous import keep_previous
 log = logging.getLogger("lexsplat")
 
 
-def write_provenance(folder: SceneFolder, capture: Capture, config: BuildConfig) -> str:
-    """Record the capture and the settings of a build; returns a fingerprint of photos, masks, cameras and split."""
-    views = {
+def hash_capture(capture: Capture) -> tuple[dict[str, str], str]:
+    """Hashes of the photos by view, and a fingerprint of photos, masks, cameras and split."""
+    sources = {name: file_hash(view.image_path) for name, view in capture.views.items()}
+    masks = {n: file_hash(v.ignore_path) for n, v in capture.views.items() if v.ignore_path is not None}
+    splits = _cameras_with_split(capture).items()
+    cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), split] for n, (c, split) in splits}
+    return sources, fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
+
+
+def _cameras_with_split(capture: Capture) -> dict[str, tuple[Camera, str]]:
+    return {
         name: (view.camera, "test" if name in capture.test_names else "train")
         for name, view in capture.views.items()
     }
-    sources = {name: file_hash(view.image_path) for name, view in capture.views.items()}
-    masks = {n: file_hash(v.ignore_path) for n, v in capture.views.items() if v.ignore_path is not None}
+
+
+def write_provenance(
+    folder: SceneFolder, capture: Capture, config: BuildConfig, sources: dict[str, str]
+) -> None:
+    """Record the capture, the hashes of its photos (`hash_capture`) and the settings of a build."""
+    views = _cameras_with_split(capture)
     keep_previous(folder)
     folder.save()
     folder.write_cameras(views)
@@ -57,8 +70,6 @@ def write_provenance(folder: SceneFolder, capture: Capture, config: BuildConfig)
     }
     record_warnings(folder, capture)
     folder.save()
-    cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), s] for n, (c, s) in views.items()}
-    return fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
 
 
 def record_warnings(folder: SceneFolder, capture: Capture) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +17,14 @@ from lexsplat.rendering import render
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 from lexsplat.runtime.files import refuse_pickle
 from lexsplat.runtime.fingerprints import file_hash, fingerprint
+from lexsplat.runtime.progress import NOTE
 from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.formats.reading import reader_of, splat_file
 from lexsplat.scenes.formats.sog import META
 from lexsplat.scenes.formats.sog_streamed import LOD_META
+from lexsplat.scenes.formats.splat import WITHOUT_MIP_FLAG
+
+log = logging.getLogger("lexsplat")
 
 CHECKED_VIEWS = 8
 """Number of views in which the Gaussians are looked for."""
@@ -28,6 +34,10 @@ MIN_COVERAGE = 0.1
 
 MIN_AGREEMENT = 0.25
 """Least median correlation of renders with photos in these views."""
+
+
+_COMPARED_VIEWS = 4
+"""Number of views that are rendered at full size with and without the mip filter."""
 
 
 def existing_splats(path: Path | None) -> Path:
@@ -94,6 +104,30 @@ def check_agreement(gaussians: Gaussians, views: list[View], subject: Path) -> N
             found=f"renders that correlate with the photos by {np.median(agreements):.2f}",
             remedy="use the photos and poses with which the Gaussians were trained",
         )
+
+
+def with_filter_of_photos(gaussians: Gaussians, views: list[View], subject: Path) -> Gaussians:
+    """The Gaussians with the mip filter, or without, whichever renders the photos better.
+
+    Only for files of `WITHOUT_MIP_FLAG`; the other formats say it. A note names what is taken instead of the default.
+    """
+    if not str(subject).lower().endswith(WITHOUT_MIP_FLAG):
+        return gaussians
+    plain, filtered = (replace(gaussians, antialiased=needed) for needed in (False, True))
+    errors = np.zeros(2)
+    for view in evenly(views, _COMPARED_VIEWS):
+        photo = view.load_image((view.camera.width, view.camera.height))
+        with torch.no_grad():
+            renders = [
+                render(each, view.camera, color=True).image.cpu().numpy() for each in (plain, filtered)
+            ]
+        errors += [float(np.square(image - photo).mean()) for image in renders]
+    if errors[1] >= errors[0]:
+        return plain
+    before, after = -10 * np.log10(np.maximum(errors / min(len(views), _COMPARED_VIEWS), 1e-12))
+    told = "%s: read as trained with the mip filter, which the format cannot say: PSNR to photos %.2f dB, else %.2f"
+    log.log(NOTE, told, subject, after, before)
+    return filtered
 
 
 def _details(image: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -174,11 +174,15 @@ class Selection:
         return None if scale is None else self.size * scale
 
     def distance_to(self, other: Selection) -> float:
-        """Distance between the centers of the boxes of two selections, world units.
+        """Distance between the centers of the boxes of two selections of one scene, world units.
 
         Raises:
             QueryError: If one is empty.
+            TypeError, ValueError: If the other is no selection, or of another scene.
         """
+        if not isinstance(other, Selection):
+            raise TypeError(f"expected a Selection, got {other!r}"[:200])
+        self._check_scene(other)
         return float(np.linalg.norm(self.center - other.center))
 
     @cached_property
@@ -359,8 +363,7 @@ class Selection:
     ) -> Selection:
         if not isinstance(other, Selection):
             return NotImplemented
-        if not self.is_of(other.gaussians):
-            raise ValueError("the selections are of different scenes")
+        self._check_scene(other)
         mask = combine(self.mask, other.mask)
         scores = self.scores if word == "minus" else torch.maximum(self.scores, other.scores)
         ranks = [PRESENCES.index(self.present), PRESENCES.index(other.present)]
@@ -371,6 +374,10 @@ class Selection:
         parts = () if word == "or" else self.parts
         facts = {"present": PRESENCES[present], "phrase": phrase, "threshold": threshold, "parts": parts}
         return replace(self, mask=mask, scores=scores, **facts)  # type: ignore[arg-type]
+
+    def _check_scene(self, other: Selection) -> None:
+        if not self.is_of(other.gaussians):
+            raise ValueError("the selections are of different scenes")
 
     def described(self, box: Box | None = None, **facts: Any) -> Selection:
         """The same Gaussians with other facts, such as ``phrase`` or ``scores``; a known box stays known."""

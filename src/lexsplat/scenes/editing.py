@@ -29,8 +29,9 @@ from lexsplat.queries.visibility import whole_things, with_remains
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
+from lexsplat.scenes.colors import parse_color
 from lexsplat.scenes.filling import Fill, fill_for
-from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.folder import SceneFolder, refuse_within_scene
 from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.gone import gone_nouns
 from lexsplat.scenes.journal import CHANGES, Journal, Kind, Step, packed, unpacked
@@ -147,6 +148,9 @@ class Motion:
         rotation: R ``[3, 3]``, a proper rotation; None is the identity.
         scale: Factor on sizes, positive.
         turn: Degrees about the up direction, counterclockwise from above, after the rotation.
+
+    Raises:
+        ValueError: If the translation is not three numbers, or the rotation no ``[3, 3]``.
     """
 
     translation: Sequence[float] = (0.0, 0.0, 0.0)
@@ -154,12 +158,27 @@ class Motion:
     scale: float = 1.0
     turn: float = 0.0
 
+    def __post_init__(self) -> None:
+        for name, shape in (("translation", (3,)), ("rotation", (3, 3))):
+            value = getattr(self, name)
+            if value is not None and np.shape(value) != shape:
+                raise ValueError(f"{name} must have the shape {shape}, got {value!r}"[:200])
+
     def values(self, chosen: Selection) -> dict[str, Any]:
-        """The numbers of a `Step` that moves ``chosen``."""
+        """The numbers of a `Step` that moves ``chosen``.
+
+        Raises:
+            QueryError: If nothing would move.
+        """
+        rotation = np.eye(3) if self.rotation is None else self.rotation
+        still = self.scale == 1 and not self.turn and not np.any(self.translation)
+        if still and np.array_equal(rotation, np.eye(3)):
+            raise QueryError(
+                "motion", expected="a translation, a rotation or a scale other than 1", found="none of them"
+            )
         center, lift = np.zeros(3), np.zeros(3)
         if chosen:
             center, lift = chosen.center, (self.scale - 1) * chosen.box.half_sizes[2] * chosen.up.direction
-        rotation = np.eye(3) if self.rotation is None else self.rotation
         if self.turn:
             rotation = rotation_about(chosen.up.direction, self.turn) @ rotation
         vectors = {
@@ -262,8 +281,15 @@ class Editor:
         """Remove everything but a selection."""
         self._do("keep", chosen)
 
-    def recolor(self, chosen: Selection, color: Sequence[float], strength: float = 1.0) -> None:
-        """Give a selection another color, RGB in 0..1, with its old shading (`recolored`)."""
+    def recolor(self, chosen: Selection, color: Sequence[float] | str, strength: float = 1.0) -> None:
+        """Give a selection another color with its old shading (`recolored`).
+
+        Args:
+            chosen: The selection.
+            color: RGB in 0..1, "#ff8800" or a name such as "orange".
+            strength: See `recolored`.
+        """
+        color = parse_color([color]) if isinstance(color, str) else color
         self._do("recolor", chosen, color=[float(c) for c in color], strength=float(strength))
 
     def move(self, chosen: Selection, motion: Motion, fill: bool = True) -> None:
@@ -275,17 +301,19 @@ class Editor:
             fill: Close the surface under its things at their old places, as `delete` does.
 
         Raises:
+            QueryError: If nothing would move.
             ValueError: If the motion is invalid (see `lexsplat.scenes.transforms.transformed`).
         """
-        self._do("move", chosen, fill, **motion.values(chosen))
+        self._do("move", chosen, fill, motion)
 
     def duplicate(self, chosen: Selection, motion: Motion) -> None:
         """Add a copy of a selection, transformed as by `move`.
 
         Raises:
+            QueryError: If the copy would not be moved.
             ValueError: If the motion is invalid (see `lexsplat.scenes.transforms.transformed`).
         """
-        self._do("duplicate", chosen, **motion.values(chosen))
+        self._do("duplicate", chosen, False, motion)
 
     def undo(self) -> bool:
         """Undo the last step; False if there is none."""
@@ -304,13 +332,13 @@ class Editor:
             self._advance(self.undone.pop())
         return True
 
-    def save(self, output: Path) -> SceneFolder:
+    def save(self, output: str | Path) -> SceneFolder:
         """Write the edited scene into a new folder; its ``scene.json`` lists the steps.
 
         Raises:
-            SceneFolderError: If the folder exists, or the scene was not opened from one.
+            SceneFolderError: If the folder exists or lies in a scene, or the scene was not opened from one.
         """
-        source = self.original.folder
+        source, output = self.original.folder, Path(output)
         if source is None:
             raise SceneFolderError(
                 output,
@@ -323,6 +351,7 @@ class Editor:
             raise SceneFolderError(
                 output, expected="a new folder", found=found, remedy="give another --output"
             )
+        refuse_within_scene(output)
         folder = SceneFolder(output)
         record = json.loads(json.dumps(source.record))
         record["edits"] = [*record.get("edits", ()), *map(str, self.steps)]
@@ -331,6 +360,7 @@ class Editor:
         )
         record["gone"] = sorted(gone_nouns(self.scene))
         record["stages"].get("reconstruct", {})["gaussians"] = len(self.scene.gaussians)
+        record["stages"].get("language", {}).update(self.scene.field.facts())
         stages, record["stages"] = record["stages"], {}
         folder.record = record
         output.mkdir(parents=True)
@@ -354,10 +384,17 @@ class Editor:
         extend = with_remains if kind == "delete" else whole_things
         return extend(chosen, self.scene.hidden, self.scene.field.segments).mask
 
-    def _do(self, kind: Kind, chosen: Selection, fill: bool = False, **values: Any) -> None:
+    def _do(
+        self, kind: Kind, chosen: Selection, fill: bool = False, motion: Motion | None = None, **values: Any
+    ) -> None:
+        if not isinstance(chosen, Selection):
+            raise TypeError(f"expected a Selection, such as editor.scene.find(...), got {chosen!r}"[:200])
+        if kind in ("move", "duplicate") and not isinstance(motion, Motion):
+            raise TypeError(f"expected a Motion, such as Motion(translation=(1, 0, 0)), got {motion!r}"[:200])
         if not chosen.is_of(self.scene.gaussians):
             raise ValueError(
-                "the selection was made before the last edit: select again in the scene of the editor"
+                "the selection is of another scene, or was made before the last edit: select again in the scene"
+                " of the editor"
             )
         if not chosen:
             raise QueryError(
@@ -366,6 +403,8 @@ class Editor:
                 found="nothing",
                 remedy="try other words or a lower threshold",
             )
+        if motion is not None:
+            values = motion.values(chosen)
         mask = self.planned_mask(kind, chosen)
         gone = self.planned_mask("delete", chosen) if kind in ("delete", "move") else mask
         if fill:

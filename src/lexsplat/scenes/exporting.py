@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from lexsplat.queries.selection import Selection
 from lexsplat.queries.visibility import whole_things
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path, write_json
+from lexsplat.runtime.progress import NOTE
 from lexsplat.scenes.formats.compressed import COMPRESSED, write_compressed
 from lexsplat.scenes.formats.gltf import write_glb
 from lexsplat.scenes.formats.language import (
@@ -26,10 +28,12 @@ from lexsplat.scenes.formats.language import (
 )
 from lexsplat.scenes.formats.ply import write_ply
 from lexsplat.scenes.formats.sog_writing import write_sog
-from lexsplat.scenes.formats.splat import write_splat
+from lexsplat.scenes.formats.splat import WITHOUT_MIP_FLAG, write_splat
 from lexsplat.scenes.formats.spz import write_spz
 from lexsplat.scenes.formats.tables import write_labels_csv, write_points_ply
 from lexsplat.scenes.scene import Scene
+
+log = logging.getLogger("lexsplat")
 
 SPLAT_ENDINGS = (".points.ply", *COMPRESSED, ".ply", ".splat", ".v3.spz", ".spz", ".sog", ".glb")
 """Formats of Gaussians or their points; the first that fits is taken."""
@@ -114,6 +118,9 @@ def export_gaussians(
             remedy = "write .ply, or delete what is far away"
             expected = f"Gaussians that {ending} can hold"
             raise SceneFolderError(path, expected=expected, found=str(error), remedy=remedy) from error
+    if gaussians.antialiased and ending in WITHOUT_MIP_FLAG:
+        told = "%s: %s cannot say that the Gaussians need the mip filter, without which thin ones look too bold; %s"
+        log.log(NOTE, told, path, ending, "use .ply, .spz, .sog or .glb where the program reads one of them")
     return written
 
 

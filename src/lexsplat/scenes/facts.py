@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from lexsplat.geometry.world import world_of
 from lexsplat.scenes.folder import SceneFolder
-from lexsplat.scenes.unsaved import saving, unsaved_steps
+from lexsplat.scenes.previous import REBUILD
+from lexsplat.scenes.unsaved import discarding, outdated_steps, saving, unsaved_steps
 
 NO_SEGMENTS = (
     "single Gaussians answer; lexsplat language CAPTURE --output SCENE, with the options of the build, adds segments"
-    " (method averaged)"
+    " (method averaged) to a scene without edits"
 )
 """A note on a scene without segments: the consequence, and how to add them."""
 
@@ -30,19 +31,24 @@ def _chosen_views(record: Mapping[str, Any]) -> dict[str, Any] | None:
     return {name: record["stages"]["views"].get(name) for name in names}
 
 
-def unsaved_note(folder: SceneFolder | None, given: str = "") -> str:
-    """That steps of an edit are not in the scene that answers, and how to get them; empty without such steps.
+def version_notes(folder: SceneFolder, given: str = "") -> Iterator[str]:
+    """What the scene that answers does not hold, a rebuild or steps of an edit, and what to do about it.
 
     Args:
-        folder: The scene folder; None for a scene in memory.
+        folder: The scene folder.
         given: How the user named the scene, if not by its folder.
     """
-    count = unsaved_steps(folder) if folder is not None else 0
-    if folder is None or not count:
-        return ""
-    steps = "1 step of lexsplat edit is" if count == 1 else f"{count:,} steps of lexsplat edit are"
     named = given or ("demo" if folder.is_bundled else str(folder.root))
-    return f"{steps} not in this scene; {saving(named, count)}"
+
+    def steps(count: int) -> str:
+        return "1 step of lexsplat edit" if count == 1 else f"{count:,} steps of lexsplat edit"
+
+    if folder.content != folder.root:
+        yield f"this is the scene before a rebuild, which {REBUILD}"
+    if count := unsaved_steps(folder):
+        yield f"{steps(count)} {'is' if count == 1 else 'are'} not in this scene; {saving(named, count)}"
+    if count := outdated_steps(folder):
+        yield f"{steps(count)} {discarding(named, count)}"
 
 
 def scene_facts(folder: SceneFolder) -> dict[str, Any]:
@@ -78,7 +84,10 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "gaussian_bytes": folder.bytes_on_disk(folder.gaussians_path),
         "language_bytes": folder.bytes_on_disk(folder.language_path),
         "code_map_bytes": folder.bytes_on_disk(folder.root / "codes"),
+        "edits": record.get("edits", []),
         "unsaved_steps": unsaved_steps(folder),
+        "outdated_steps": outdated_steps(folder),
+        "rebuilding": folder.content != folder.root,
         "warnings": len(record.get("warnings", [])),
         "lexsplat": record.get("provenance", {}).get("lexsplat"),
     }

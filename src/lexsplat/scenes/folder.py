@@ -148,7 +148,7 @@ class SceneFolder:
                 "demo",
                 expected="a scene folder of your own",
                 found="the bundled scene",
-                remedy="make your own copy of it with: lexsplat demo",
+                remedy="build a scene of the same photos with: lexsplat demo",
             )
 
     @property
@@ -217,6 +217,20 @@ class SceneFolder:
                 expected="a new folder or one of an earlier build",
                 found="a file of another program",
                 remedy="give another --output",
+            )
+
+    def refuse_edited(self) -> None:
+        """Refuse to build into a saved edit, whose photos are of the scene before its edits.
+
+        Raises:
+            SceneFolderError: If ``scene.json`` lists edits.
+        """
+        if edits := self.record.get("edits"):
+            raise SceneFolderError(
+                self.root,
+                expected="a new folder or a scene without edits",
+                found=f"a scene with {len(edits)} edit{'' if len(edits) == 1 else 's'}, which a build would undo",
+                remedy="give another --output, and edit the scene that is built there",
             )
 
     # -- stages
@@ -422,6 +436,21 @@ def _pixel_data(content: bytes, size: tuple[int, int]) -> bytes:
             packed.append(content[place + 8 : place + 8 + length])
         place += 12 + length
     return zlib.decompressobj().decompress(b"".join(packed), size[1] * (size[0] + 1) + 1)
+
+
+def refuse_within_scene(path: Path) -> None:
+    """Refuse to write a page or another scene into a scene folder, whose files are those of one scene.
+
+    Raises:
+        SceneFolderError: If a folder above is a scene.
+    """
+    if above := next((each for each in path.absolute().parents if (each / "scene.json").is_file()), None):
+        raise SceneFolderError(
+            path,
+            expected="a place outside of scene folders",
+            found=f"one in the scene {above}",
+            remedy="give a folder beside it",
+        )
 
 
 def file_of(folder: SceneFolder | None, name: str) -> Path:

@@ -20,6 +20,9 @@ from lexsplat.scenes.folder import SCENE_FILES, SceneFolder
 FOLDER = "previous"
 """Name of the folder within the scene folder."""
 
+REBUILD = "is at work or was interrupted: wait for it, or run the build again"
+"""The state of a scene that its previous version answers for, and what to do."""
+
 
 def keep_previous(folder: SceneFolder) -> None:
     """Keep a finished scene and mark its record; the unfinished result of an interrupted build is not kept.
@@ -57,6 +60,11 @@ def previous_of(folder: SceneFolder) -> SceneFolder | None:
     if not (folder.root / FOLDER / "scene.json").is_file():
         return None
     return SceneFolder(folder.root, content=folder.root / FOLDER)
+
+
+def version_that_answers(folder: SceneFolder) -> SceneFolder:
+    """The folder itself, or its previous version while a build is at work or after one was interrupted."""
+    return (previous_of(folder) if folder.record.get("building") else None) or folder
 
 
 def require_current(folder: SceneFolder) -> None:

@@ -14,7 +14,7 @@ from lexsplat.queries.relevancy import QueryConfig
 from lexsplat.runtime.errors import FileFormatError, SceneFolderError
 from lexsplat.runtime.files import read_tensors
 from lexsplat.scenes.folder import SceneFolder, StoredView
-from lexsplat.scenes.previous import previous_of
+from lexsplat.scenes.previous import version_that_answers
 
 _ATTEMPTS = 5
 """How often reading is tried again because a build has changed the folder in the meantime."""
@@ -67,8 +67,7 @@ def read_scene(path: Path, device: str) -> SceneContent:
         folder = SceneFolder.open(path)
         attempts += 1
         try:
-            kept = previous_of(folder) if folder.record.get("building") else None
-            return _read_content(kept or folder, device)
+            return _read_content(version_that_answers(folder), device)
         except (SceneFolderError, FileFormatError) as error:
             if _state(SceneFolder.open(path)) == _state(folder):
                 raise

@@ -134,7 +134,7 @@ def error_document(error: LexsplatError) -> dict[str, Any]:
 
 def sentence(answer: Mapping[str, Any]) -> str:
     """An answer of `find_phrase` in one plain sentence."""
-    understood = shortened(answer["understood"])
+    understood = worded(answer["understood"])
     if answer["present"] == "no":
         text = f"Not here: nothing fits {understood}."
     elif not answer["instances"]:
@@ -167,6 +167,11 @@ def seen_in(thing: Mapping[str, Any]) -> str:
 def shortened(text: str, length: int = 200) -> str:
     """A text for a sentence."""
     return text if len(text) <= length else f"{text[:length]}..."
+
+
+def worded(understood: str) -> str:
+    """How a phrase was understood, for a sentence: "(red any object)" as "anything red"."""
+    return shortened(re.sub(r"\(([^()\"]+) any object\)", r"anything \1", understood))
 
 
 def counted(count: int, what: str) -> str:

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import io
 import json
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 from urllib.parse import quote
 
@@ -18,10 +18,10 @@ from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 
 from lexsplat.pipeline.inputs import reload_capture
-from lexsplat.runtime.errors import BackendError, LexsplatError, QueryError
+from lexsplat.runtime.errors import BackendError, LexsplatError, QueryError, SceneFolderError
 from lexsplat.scenes.publishing.index import PAGE_FILES, folder_index, page_file
 from lexsplat.scenes.serving import error_document
-from lexsplat.viewer.requests import Asked, read_document
+from lexsplat.viewer.requests import ASKED, Asked, read_document, refuse_unknown
 from lexsplat.viewer.session import Session
 
 _TYPES = {"js": "text/javascript", "css": "text/css", "txt": "text/plain", "wasm": "application/wasm"}
@@ -94,6 +94,7 @@ def _download(session: Session, data: dict[str, Any]) -> Response:
 
 
 def _edit(session: Session, data: dict[str, Any]) -> Response:
+    refuse_unknown(data, ("version", "action", *ASKED, "color", "strength", "by", "turn", "scale"))
     return JSONResponse(session.edit(str(data.get("action")), Asked.from_json(data), data))
 
 
@@ -110,6 +111,18 @@ def _bytes(content: bytes) -> Response:
     return Response(content, media_type="application/octet-stream")
 
 
+@contextlib.contextmanager
+def _without_options() -> Iterator[None]:
+    """Errors of photos that are not found, without advice for commands that have --capture."""
+    try:
+        yield
+    except SceneFolderError as error:
+        remedy = "put the photos back where the build found them"
+        raise SceneFolderError(
+            error.subject, expected=error.expected, found=error.found, remedy=remedy
+        ) from error
+
+
 def _photos(session: Session) -> Callable[[Request], Awaitable[Response]]:
     """The photos that the scene was built from, if they are still there, by their numbers in the manifest."""
     capture = functools.cache(reload_capture)
@@ -120,7 +133,7 @@ def _photos(session: Session) -> Callable[[Request], Awaitable[Response]]:
             folder = session.scene.folder
             if folder is None or number >= len(views):
                 raise QueryError("photo", expected="a view of a scene folder", found="none")
-            with session.lock:
+            with session.lock, _without_options():
                 view = capture(folder).views[views[number]["name"]]
             shrink = min(1.0, _PHOTO_SIDE / max(view.camera.width, view.camera.height))
             size = (max(1, round(view.camera.width * shrink)), max(1, round(view.camera.height * shrink)))

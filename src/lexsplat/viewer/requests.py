@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,10 @@ from lexsplat.viewer.history import MAX_LENGTH
 
 MOST_PIXELS = 16_384
 """Width and height of a page, at most."""
+
+
+ASKED = ("prompt", "camera", "click", "threshold", "instance")
+"""Keys of `Asked.from_json`."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Asked:
         prompt, click, threshold = data.get("prompt") or "", data.get("click"), data.get("threshold")
         if not isinstance(prompt, str) or len(prompt) > MAX_LENGTH:
             found = f"{len(prompt)} characters" if isinstance(prompt, str) else type(prompt).__name__
-            raise QueryError("prompt", expected=f"at most {MAX_LENGTH} characters", found=found)
+            raise QueryError("prompt", expected=f"a text of at most {MAX_LENGTH} characters", found=found)
         camera = None if data.get("camera") is None else _camera(data["camera"])
         if click is not None and camera is None:
             raise QueryError("click", expected="a camera with it", found="none")
@@ -77,6 +81,16 @@ def read_document(body: bytes) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise QueryError("request", expected="a JSON object", found=type(found).__name__)
     return found
+
+
+def refuse_unknown(data: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Refuse a request with keys that nothing reads, which are misspelled as a rule.
+
+    Raises:
+        QueryError: If there is one.
+    """
+    if unknown := sorted(set(data) - set(known)):
+        raise QueryError("request", expected=f"keys out of {', '.join(known)}", found=repr(unknown[0])[:40])
 
 
 def number(data: Mapping[str, Any], name: str, default: float) -> float:

@@ -147,8 +147,8 @@ def load_annotations(
 
     Raises:
         CaptureError: If a given folder does not exist or holds no ground truth, a file belongs to no view or several
-            or does not fit its photo, a class is missing, the capture has no prompt lists, or no mask is named
-            after one of their prompts.
+            or does not fit its photo, two files mean one prompt in one view, a class is missing, the capture has no
+            prompt lists, or no mask is named after one of their prompts.
         FileFormatError: If a label file is not in LangSplat's format.
     """
     check_ground_truth_options(capture.root, folder, prompt_list)
@@ -210,7 +210,7 @@ def _read_masks(capture: Capture, folder: Path, layout: str) -> Annotations:
     for view_folder in mask_folders(folder):
         stem = view_folder.relative_to(folder).as_posix()
         view = capture.views[_the_image(stem, layout, capture, view_folder)]
-        files = {path.stem.replace("_", " "): path for path in sorted(view_folder.glob("*.png"))}
+        files = _masks_by_prompt(view_folder)
         if layout == "3d-ovs":
             files = {name: view_folder / f"{name}.png" for name in classes}
         for path in files.values():
@@ -225,6 +225,25 @@ def _read_masks(capture: Capture, folder: Path, layout: str) -> Annotations:
         masks.setdefault(view.name, {}).update(files)
     ordered = {name: dict(sorted(masks[name].items())) for name in sorted(masks)}
     return Annotations(layout, folder, ordered)
+
+
+def _masks_by_prompt(view_folder: Path) -> dict[str, Path]:
+    """The masks of a view by the prompts that their names mean.
+
+    Raises:
+        CaptureError: If two names mean one prompt.
+    """
+    files: dict[str, Path] = {}
+    for path in sorted(view_folder.glob("*.png")):
+        other = files.setdefault(path.stem.replace("_", " "), path)
+        if other is not path:
+            raise CaptureError(
+                view_folder,
+                expected="a mask for each prompt",
+                found=f"{other.name} and {path.name}, which mean the same one",
+                remedy="remove one of them",
+            )
+    return files
 
 
 def _read_classes(path: Path) -> tuple[str, ...]:
@@ -275,7 +294,8 @@ def _read_lerf_ovs(capture: Capture, folder: Path) -> Annotations:
         view = capture.views[_the_image(stem_of(image), "lerf-ovs", capture, path)]
         parts: dict[str, list[tuple[NDArray[np.bool_], NDArray[np.float64]]]] = {}
         for category, box, polygon in objects:
-            mask = view.undistort_mask(polygon_mask(polygon, *size), path)
+            corners = polygon if len(polygon) > 2 else polygon[:0]  # two corners enclose nothing
+            mask = view.undistort_mask(polygon_mask(corners, *size), path)
             if view.lens.distorts:  # the label's box is around the object in the distorted photo
                 box = _box_around(mask)
             parts.setdefault(category, []).append((mask, box))

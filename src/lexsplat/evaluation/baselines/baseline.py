@@ -49,5 +49,9 @@ class Baseline(Protocol):
     def knows_prompts(self) -> bool:
         """Whether the prompts of the evaluation are known to it in advance, as classes."""
 
+    @property
+    def needs_crop_sizes(self) -> bool:
+        """Whether it reads features of several crop sizes (`TrainingData.level_maps`)."""
+
     def fit(self, data: TrainingData, run: BaselineRun) -> Method:
         """Make the object that answers prompts."""

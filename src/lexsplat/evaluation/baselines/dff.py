@@ -46,6 +46,7 @@ class Dff:
     settings: DffConfig = DffConfig()
     name: ClassVar[str] = "dff"
     knows_prompts: ClassVar[bool] = False
+    needs_crop_sizes: ClassVar[bool] = False
 
     def fit(self, data: TrainingData, run: BaselineRun) -> GaussianFeatures:
         """Fit CLIP features to the Gaussians; events are of stage "dff"."""

@@ -141,6 +141,7 @@ class Lerf:
     settings: LerfConfig = LerfConfig()
     name: ClassVar[str] = "lerf"
     knows_prompts: ClassVar[bool] = False
+    needs_crop_sizes: ClassVar[bool] = True
 
     def fit(self, data: TrainingData, run: BaselineRun) -> GaussianFeatures:
         """Average CLIP at each scale over the training views, then over similar neighbors.

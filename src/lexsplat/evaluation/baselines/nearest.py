@@ -59,7 +59,7 @@ class ViewFeatures:
 class Nearest:
     """The baseline."""
 
-    name, settings, knows_prompts = "nearest", None, False
+    name, settings, knows_prompts, needs_crop_sizes = "nearest", None, False, False
 
     def fit(self, data: TrainingData, run: BaselineRun) -> ViewFeatures:
         """The maps of all views; nothing is fitted."""

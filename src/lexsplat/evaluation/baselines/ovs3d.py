@@ -188,6 +188,7 @@ class Ovs3d:
     settings: Ovs3dConfig = Ovs3dConfig()
     name: ClassVar[str] = "3dovs"
     knows_prompts: ClassVar[bool] = True
+    needs_crop_sizes: ClassVar[bool] = True
 
     def fit(self, data: TrainingData, run: BaselineRun) -> ClassFeatures:
         """Fit features to the Gaussians with the prompts as classes; events are of stage "3dovs".

@@ -177,10 +177,12 @@ class CodeField:
         )
 
     def facts(self) -> dict[str, Any]:
-        """Use of the likeliest codes, and number of Gaussians without a code."""
+        """Use of the likeliest codes, and numbers of Gaussians without a code, of segments and of levels."""
         first = torch.cat([codes[:, 0] for codes in self.codes.chunk(self.num_levels, 1)]).cpu().numpy()
         used = code_usage([first], self.codebook.num_codes).facts()
-        return {**used, "unseen": self.unseen} | ({"levels": self.num_levels} if self.num_levels > 1 else {})
+        segments = {} if self.segments is None else {"segments": self.segments.levels.shape[1]}
+        levels = {"levels": self.num_levels} if self.num_levels > 1 else {}
+        return {**used, "unseen": self.unseen, **levels, **segments}
 
     def content(self) -> tuple[Tensor, ...]:
         """Codes, weights and codewords."""

@@ -24,6 +24,7 @@ from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.progress import NOTE, Listener, kept_warnings, uncounted, warn_again
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.reading import read_splats
+from lexsplat.scenes.unsaved import refuse_to_lose_steps
 
 log = logging.getLogger("lexsplat")
 
@@ -59,6 +60,7 @@ def capture_of_splats(
     key = fingerprint(_RULES, splats_hash(splats), *settings)
     complete = (poses / "transforms.json").is_file() and (poses / _FLOATERS).is_file()
     if not (complete and folder.is_finished("views", key)):
+        refuse_to_lose_steps(folder)
         start = time.perf_counter()
         folder.reopen("views")
         with kept_warnings() as warnings:

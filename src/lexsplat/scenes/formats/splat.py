@@ -16,6 +16,9 @@ from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.formats.foreign import as_tensor, damaged, logits_of_bytes, read_content
 
+WITHOUT_MIP_FLAG = (".splat", ".ksplat")
+"""Endings of the formats that cannot say whether Gaussians need the mip filter."""
+
 _LAYOUT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 

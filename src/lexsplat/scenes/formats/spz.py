@@ -283,7 +283,11 @@ def write_spz(gaussians: Gaussians, path: Path, *, version: int = 4) -> None:
         content = _HEADER.pack(*fields, 0) + b"".join(streams.values())
         path.write_bytes(gzip.compress(content, mtime=0))
         return
-    packed = {name: zstandard.ZstdCompressor(level=12).compress(data) for name, data in streams.items()}
+    # Without a checksum, nearly any changed byte would be read as other values. Other readers of zstd know it.
+    packed = {
+        name: zstandard.ZstdCompressor(level=12, write_checksum=True).compress(data)
+        for name, data in streams.items()
+    }
     table = b"".join(struct.pack("<QQ", len(packed[name]), len(data)) for name, data in streams.items())
     header = _HEADER_4.pack(*fields, len(streams), _HEADER_4.size)
     path.write_bytes(header + table + b"".join(packed.values()))

@@ -28,7 +28,7 @@ from lexsplat.scenes.library.found import Found, Hit
 from lexsplat.scenes.library.indexed import Indexed, answer_from, decidable, with_world
 from lexsplat.scenes.library.mending import orphans, rebuilt
 from lexsplat.scenes.library.records import Record
-from lexsplat.scenes.serving import shortened
+from lexsplat.scenes.serving import shortened, worded
 
 if TYPE_CHECKING:
     from lexsplat.scenes.library.library import Library
@@ -103,7 +103,7 @@ def _note_of(asked: Understood, hits: Sequence[Hit], encoders: Iterable[str]) ->
     for hit in hits:
         parts = hit.answer["note"].split("; ") if hit.answer["note"] else []
         if hit.answer["understood"] != hits[0].answer["understood"]:
-            parts.append(f"understood as {shortened(hit.answer['understood'])}")
+            parts.append(f"understood as {worded(hit.answer['understood'])}")
         for part in dict.fromkeys(parts):
             scenes.setdefault(part, []).append(hit.scene)
     notes = [
