@@ -24,9 +24,9 @@ from lexsplat.codebook import Codebook
 from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import CodeField
-from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.publishing.index import page_file
 from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.views import StoredView
 from lexsplat.viewer.server import ViewerConfig, ViewerServer
 
 PROMPTS = (

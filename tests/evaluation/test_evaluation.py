@@ -28,8 +28,8 @@ from lexsplat.evaluation.metrics import average_precision, mask_scores, threshol
 from lexsplat.evaluation.protocols import Lerf2dScores, OfficialScores
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.queries.relevancy import QueryConfig
-from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.views import StoredView
 
 WORDS = {"red apple": 1, "blue ball": 2}
 

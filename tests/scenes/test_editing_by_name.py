@@ -14,8 +14,8 @@ from lexsplat.language.fields import CodeField
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.editing import Editor, Motion
-from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.views import StoredView
 
 
 @pytest.fixture(scope="module")

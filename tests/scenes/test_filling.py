@@ -17,8 +17,8 @@ from lexsplat.rendering import render
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.filling import Fill, fill_for
-from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.views import StoredView
 
 LEFT, RIGHT = np.array([0.8, 0.3, 0.1]), np.array([0.2, 0.5, 0.7])
 

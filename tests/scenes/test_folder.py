@@ -10,7 +10,8 @@ import pytest
 from lexsplat.geometry.cameras import look_at
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
-from lexsplat.scenes.folder import SceneFolder, StoredView, refuse_within_scene, view_named
+from lexsplat.scenes.folder import SceneFolder, refuse_within_scene
+from lexsplat.scenes.views import StoredView, view_named
 
 
 def test_a_stage_is_finished_only_for_the_same_inputs(tmp_path):

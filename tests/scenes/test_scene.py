@@ -17,8 +17,9 @@ from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.scenes import answers as answers_module
 from lexsplat.scenes.answers import default_views, find_phrases
 from lexsplat.scenes.exporting import export_gaussians, export_scene
-from lexsplat.scenes.folder import BUNDLED_SCENE, StoredView
+from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.scene import open_scene
+from lexsplat.scenes.views import StoredView
 
 BALLS = ["ball 0", "ball 1", "ball 2"]
 

@@ -8,8 +8,8 @@ import torch
 from lexsplat.codebook import Codebook
 from lexsplat.language.fields import CodeField
 from lexsplat.queries.relevancy import CANONICAL_PHRASES
-from lexsplat.scenes.folder import StoredView
 from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.views import StoredView
 from support.language_scene import LanguageScene, make_scene
 
 WORDS = [f"ball {number}" for number in range(5)]

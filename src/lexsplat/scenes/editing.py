@@ -11,17 +11,15 @@ import copy
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.geometry.gaussians import SH_C0, Gaussians
-from lexsplat.geometry.rotations import rotation_about
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.segments import Segments
 from lexsplat.queries.selection import Selection
@@ -29,7 +27,7 @@ from lexsplat.queries.visibility import whole_things, with_remains
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.scenes.colors import parse_color
+from lexsplat.scenes.colors import parse_color, recolored
 from lexsplat.scenes.filling import Fill, fill_for
 from lexsplat.scenes.folder import SceneFolder, refuse_within_scene
 from lexsplat.scenes.formats.language import write_field
@@ -37,11 +35,9 @@ from lexsplat.scenes.gone import gone_nouns
 from lexsplat.scenes.journal import CHANGES, Journal, Kind, Step, packed, unpacked
 from lexsplat.scenes.kept import keep_for
 from lexsplat.scenes.scene import Scene
-from lexsplat.scenes.transforms import transformed
+from lexsplat.scenes.transforms import Motion, transformed
 
-_LUMINANCE = (0.2126, 0.7152, 0.0722)
-_BRIGHT = 0.9
-"""Quantile of the shading from which on a recolored thing may turn pale."""
+_STILL = Motion()
 MAX_GROWTH = 16
 """Largest number of Gaussians after edits, as a multiple of the original: copies of copies would fill the memory."""
 FEWEST = 2
@@ -103,93 +99,6 @@ def _without(
     return replace(remain, **tensors), language
 
 
-def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> Gaussians:
-    """The Gaussians in another color with their old shading: brighter parts stay brighter.
-
-    Args:
-        gaussians: The Gaussians of an object.
-        color: Mean RGB in 0..1 afterwards. It is darkened where more than a tenth of the thing would be brighter than
-            1, and the tenth is mixed with gray of its luminance, as highlights are.
-        strength: 0 changes nothing, 1 removes the old hue and the view-dependent color.
-
-    Raises:
-        ValueError: If a number is out of range.
-    """
-    target = torch.tensor([float(c) for c in color])
-    if target.shape != (3,) or not bool(((target >= 0) & (target <= 1)).all()) or not 0 <= strength <= 1:
-        raise ValueError(
-            f"a color is three numbers in 0..1, and strength too, got {list(color)}, {strength:g}"
-        )
-    if len(gaussians) == 0:
-        return gaussians
-    target = target.to(gaussians.sh0)
-    old = gaussians.sh0[:, 0] * SH_C0 + 0.5
-    weights = torch.tensor(_LUMINANCE).to(old)
-    light = (old.clamp(0, 1) @ weights).clamp_min(0.02)
-    shares = gaussians.opacities / gaussians.opacities.sum().clamp_min(1e-12)
-    shading = light / (light * shares).sum()
-    ordered, order = shading.sort()
-    bright = ordered[int((shares[order].cumsum(0) < _BRIGHT).sum().clamp_max(len(shading) - 1))]
-    new = target * (shading / (target.max() * bright).clamp_min(1))[:, None]
-    gray = (new @ weights)[:, None].clamp_max(1)
-    room = (1 - gray) / (new.amax(1, keepdim=True) - gray).clamp_min(1e-6)
-    new = gray + room.clamp_max(1) * (new - gray)
-    mixed = (1 - strength) * old + strength * new
-    sh0 = ((mixed - 0.5) / SH_C0)[:, None]
-    return replace(gaussians, sh0=sh0, shN=gaussians.shN * (1 - strength))
-
-
-@dataclass(frozen=True)
-class Motion:
-    """A similarity transform of a selection about the center c of its box: x -> scale R (x - c) + c + t.
-
-    Args:
-        translation: ``[3]``, world units. t is this and what keeps the bottom of the box at its height.
-        rotation: R ``[3, 3]``, a proper rotation; None is the identity.
-        scale: Factor on sizes, positive.
-        turn: Degrees about the up direction, counterclockwise from above, after the rotation.
-
-    Raises:
-        ValueError: If the translation is not three numbers, or the rotation no ``[3, 3]``.
-    """
-
-    translation: Sequence[float] = (0.0, 0.0, 0.0)
-    rotation: NDArray[np.float64] | None = None
-    scale: float = 1.0
-    turn: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, shape in (("translation", (3,)), ("rotation", (3, 3))):
-            value = getattr(self, name)
-            if value is not None and np.shape(value) != shape:
-                raise ValueError(f"{name} must have the shape {shape}, got {value!r}"[:200])
-
-    def values(self, chosen: Selection) -> dict[str, Any]:
-        """The numbers of a `Step` that moves ``chosen``.
-
-        Raises:
-            QueryError: If nothing would move.
-        """
-        rotation = np.eye(3) if self.rotation is None else self.rotation
-        still = self.scale == 1 and not self.turn and not np.any(self.translation)
-        if still and np.array_equal(rotation, np.eye(3)):
-            raise QueryError(
-                "motion", expected="a translation, a rotation or a scale other than 1", found="none of them"
-            )
-        center, lift = np.zeros(3), np.zeros(3)
-        if chosen:
-            center, lift = chosen.center, (self.scale - 1) * chosen.box.half_sizes[2] * chosen.up.direction
-        if self.turn:
-            rotation = rotation_about(chosen.up.direction, self.turn) @ rotation
-        vectors = {
-            "rotation": rotation,
-            "translation": np.asarray(self.translation, float) + lift,
-            "center": center,
-        }
-        numbers = {name: np.asarray(value, float).tolist() for name, value in vectors.items()}
-        return {**numbers, "scale": float(self.scale)}
-
-
 def _with_hidden(scene: Scene) -> LanguageField:
     """The language of a scene with the Gaussians that its photos hide, which no edit shows or hides.
 
@@ -239,7 +148,7 @@ class Editor:
         self,
         action: str,
         chosen: Selection,
-        motion: Motion = Motion(),
+        motion: Motion = _STILL,
         color: Sequence[float] = (),
         strength: float = 1.0,
         fill: bool = True,

@@ -21,8 +21,8 @@ from lexsplat.language.fields import LanguageField
 from lexsplat.runtime.files import atomic_path, write_tensors
 
 if TYPE_CHECKING:
-    from lexsplat.scenes.folder import StoredView
     from lexsplat.scenes.scene import Scene
+    from lexsplat.scenes.views import StoredView
 
 _SPREAD = 2.0
 """Standard deviations from the mean that the darkest and the brightest color stand for."""

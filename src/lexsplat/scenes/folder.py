@@ -16,7 +16,6 @@ A stage is finished when ``scene.json`` lists it; the record is written after th
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
 import zlib
 from collections.abc import Iterable, Mapping
@@ -26,69 +25,19 @@ from typing import Any
 
 import numpy as np
 
-from lexsplat.captures.images.undistortion import MAX_SIDE
-from lexsplat.captures.readers.camera_files import MAX_COORDINATE, checked_name
-from lexsplat.captures.splits import match_stem
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
+from lexsplat.runtime.errors import FileFormatError, SceneFolderError
 from lexsplat.runtime.files import atomic_path, locked, read_json, read_tensors, to_json, write_json
 from lexsplat.runtime.fingerprints import file_checksum
 from lexsplat.scenes.records import FORMAT_VERSION, read_record
+from lexsplat.scenes.views import StoredView, stored_view
 
 SCENE_FILES = ("scene.json", "cameras.json", "gaussians.ply", "language.safetensors")
 """The files of a finished scene."""
 
 BUNDLED_SCENE = Path(__file__).resolve().parents[1] / "demo" / "scene"
 """The bundled demo scene: the word ``demo`` stands for it wherever a scene folder is expected."""
-
-
-@dataclasses.dataclass(frozen=True)
-class StoredView:
-    """A view as the scene folder stores it: enough to render, without the photo."""
-
-    name: str
-    camera: Camera
-    split: str
-
-
-def view_named(views: Mapping[str, StoredView], name: str) -> StoredView:
-    """The view called ``name``, with or without its folder and its suffix.
-
-    Raises:
-        QueryError: If there is none, or several match.
-    """
-    if not isinstance(name, str):
-        expected = "the name of a view, a StoredView or a Camera"
-        raise QueryError("view", expected=expected, found=repr(name)[:60])
-    matches = match_stem(name, views)
-    if len(matches) != 1:
-        known = ", ".join(list(views)[:5])
-        raise QueryError(
-            f"view {name[:60]!r}",
-            expected="the name of a view",
-            found="no match" if not matches else f"{len(matches)} matches",
-            remedy=f"the scene has {len(views)} views, such as {known}",
-        )
-    return views[matches[0]]
-
-
-def _stored_view(entry: Any, path: Path) -> StoredView:
-    """A view of ``cameras.json``.
-
-    Raises:
-        CaptureError: If its name leads out of the folder.
-        KeyError, TypeError, ValueError, OverflowError: If an entry is missing or invalid.
-    """
-    name, split, width, height = entry["name"], entry["split"], entry["width"], entry["height"]
-    if not isinstance(name, str) or split not in ("train", "test"):
-        raise ValueError(f"view {name!r} of split {split!r}"[:100])
-    if not all(isinstance(side, int) and 1 <= side <= MAX_SIDE for side in (width, height)):
-        raise ValueError(f"size {width!r} x {height!r}"[:100])
-    camera = Camera(width, height, np.array(entry["K"], float), np.array(entry["viewmat"], float))
-    if np.abs(camera.viewmat).max() > MAX_COORDINATE:
-        raise ValueError(f"the pose of {name!r} is too far from the origin"[:100])
-    return StoredView(checked_name(name, path), camera, split)
 
 
 class SceneFolder:
@@ -320,7 +269,7 @@ class SceneFolder:
         path = self.content / "cameras.json"
         content = read_json(path, remedy="run the build again")
         try:
-            views = [_stored_view(entry, path) for entry in content["views"]]
+            views = [stored_view(entry, path) for entry in content["views"]]
             if len({view.name for view in views}) < len(views):
                 raise ValueError("duplicate views")
         except (KeyError, TypeError, ValueError, OverflowError) as error:

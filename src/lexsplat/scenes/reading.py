@@ -13,8 +13,9 @@ from lexsplat.language.fields import LanguageField, field_from_tensors
 from lexsplat.queries.relevancy import QueryConfig
 from lexsplat.runtime.errors import FileFormatError, SceneFolderError
 from lexsplat.runtime.files import read_tensors
-from lexsplat.scenes.folder import SceneFolder, StoredView
+from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.previous import version_that_answers
+from lexsplat.scenes.views import StoredView
 
 _ATTEMPTS = 5
 """How often reading is tried again because a build has changed the folder in the meantime."""

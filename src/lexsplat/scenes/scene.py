@@ -51,10 +51,11 @@ from lexsplat.runtime.lazy import at_first_call
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.answers import Answers, automatic_thresholds, in_own_words
 from lexsplat.scenes.finding import find_in, understood_in
-from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder, StoredView, view_named
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.kept import KeptObjects, kept_objects_of, seen_of
 from lexsplat.scenes.objects import objects_of
 from lexsplat.scenes.reading import read_scene
+from lexsplat.scenes.views import StoredView, view_named
 from lexsplat.scenes.words import Word, with_objects
 
 _KEPT_BYTES = 128 << 20
@@ -294,9 +295,7 @@ class Scene:
         *,
         threshold: float | None = None,
     ) -> Selection:
-        """The Gaussians that match a phrase with relations, such as "mug on the cloth".
-
-        `lexsplat.queries.grammar` describes the grammar.
+        """The Gaussians that match a phrase with relations, such as "mug on the cloth" (`lexsplat.queries.grammar`).
 
         Args:
             phrase: Free-text phrase.
@@ -419,7 +418,7 @@ class Scene:
         return view.camera if isinstance(view, StoredView) else self.view(view).camera
 
     def view(self, name: str) -> StoredView:
-        """The view called ``name`` (`lexsplat.scenes.folder.view_named`).
+        """The view called ``name`` (`lexsplat.scenes.views.view_named`).
 
         Raises:
             QueryError: If there is none, or several match.

@@ -7,7 +7,9 @@ coefficients: within a degree they mix by a matrix that depends on the rotation 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,8 +17,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.geometry.rotations import multiply_quaternions, quaternion_from_matrix
+from lexsplat.geometry.rotations import multiply_quaternions, quaternion_from_matrix, rotation_about
+from lexsplat.queries.selection import Selection
 from lexsplat.rendering.kernels.spherical_harmonics import basis_at
+from lexsplat.runtime.errors import QueryError
 
 _DIRECTIONS = 64
 
@@ -90,3 +94,54 @@ def rotated_harmonics(shN: Tensor, rotation: NDArray[np.float64]) -> Tensor:
 
 def _like(array: NDArray[np.float64], gaussians: Gaussians) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array)).to(gaussians.device)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A similarity transform of a selection about the center c of its box: x -> scale R (x - c) + c + t.
+
+    Args:
+        translation: ``[3]``, world units. t is this and what keeps the bottom of the box at its height.
+        rotation: R ``[3, 3]``, a proper rotation; None is the identity.
+        scale: Factor on sizes, positive.
+        turn: Degrees about the up direction, counterclockwise from above, after the rotation.
+
+    Raises:
+        ValueError: If the translation is not three numbers, or the rotation no ``[3, 3]``.
+    """
+
+    translation: Sequence[float] = (0.0, 0.0, 0.0)
+    rotation: NDArray[np.float64] | None = None
+    scale: float = 1.0
+    turn: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, shape in (("translation", (3,)), ("rotation", (3, 3))):
+            value = getattr(self, name)
+            if value is not None and np.shape(value) != shape:
+                raise ValueError(f"{name} must have the shape {shape}, got {value!r}"[:200])
+
+    def values(self, chosen: Selection) -> dict[str, Any]:
+        """The numbers of a `Step` that moves ``chosen``.
+
+        Raises:
+            QueryError: If nothing would move.
+        """
+        rotation = np.eye(3) if self.rotation is None else self.rotation
+        still = self.scale == 1 and not self.turn and not np.any(self.translation)
+        if still and np.array_equal(rotation, np.eye(3)):
+            raise QueryError(
+                "motion", expected="a translation, a rotation or a scale other than 1", found="none of them"
+            )
+        center, lift = np.zeros(3), np.zeros(3)
+        if chosen:
+            center, lift = chosen.center, (self.scale - 1) * chosen.box.half_sizes[2] * chosen.up.direction
+        if self.turn:
+            rotation = rotation_about(chosen.up.direction, self.turn) @ rotation
+        vectors = {
+            "rotation": rotation,
+            "translation": np.asarray(self.translation, float) + lift,
+            "center": center,
+        }
+        numbers = {name: np.asarray(value, float).tolist() for name, value in vectors.items()}
+        return {**numbers, "scale": float(self.scale)}

@@ -100,8 +100,6 @@ class Library:
         except LibraryError:
             return f"Library({str(self.root)!r}, gone)"
 
-    # -- what it holds
-
     def names(self) -> list[str]:
         """The names of all scenes, in order, even of those whose records cannot be read.
 
