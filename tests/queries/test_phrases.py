@@ -446,7 +446,5 @@ def test_other_words_are_not_taken_for_those_of_a_question(text):
 
 
 def test_what_was_understood_can_be_read():
-    assert (
-        str(parse("largest mug on the cloth but not the duck"))
-        == '(largest (("mug" on "cloth") minus "duck"))'
-    )
+    read = str(parse("largest mug on the cloth but not the duck"))
+    assert read == '(largest (("mug" on "cloth") minus "duck"))'
