@@ -266,3 +266,17 @@ def test_a_view_without_an_array_is_reported_before_anything_is_written(
     assert embed(tiny_capture, tmp_path / "scene", built, tmp_path / "empty") == 1
     assert "expected view_01.npy, view_01.safetensors or view_01_f.npy" in capsys.readouterr().err
     assert not (tmp_path / "scene" / "gaussians.ply").exists()
+
+
+def test_photos_without_segments_are_told_and_a_capture_without_any_is_refused(
+    tiny_capture, built, segments, tmp_path, capsys, caplog
+):
+    folder = shutil.copytree(segments, tmp_path / "segments")
+    paths = sorted(folder.glob("*_s.npy"))
+    np.save(paths[0], np.full((72, 96), -1))
+    assert embed(tiny_capture, tmp_path / "scene", built, folder) == 0
+    assert f"{folder}: 1 of 9 photos have no segment, and so no features" in caplog.text
+    for path in paths:
+        np.save(path, np.full((72, 96), -1))
+    assert embed(tiny_capture, tmp_path / "other", built, folder) == 1
+    assert f"{folder}: expected segments in some photo, found none in any" in capsys.readouterr().err

@@ -29,14 +29,14 @@ def red_apple(editor: Editor):
 
 
 @pytest.fixture
-def scene(tmp_path) -> Path:
+def old_copy(tmp_path) -> Path:
     """A small scene without segments."""
     return shutil.copytree(OLD, tmp_path / "scene")
 
 
 @pytest.mark.parametrize("command", ["build", "reconstruct", "language"])
-def test_a_saved_edit_is_not_built_over(scene, tmp_path, tiny_capture, capsys, command):
-    editor = Editor(open_scene(scene, device="cpu"))
+def test_a_saved_edit_is_not_built_over(old_copy, tmp_path, tiny_capture, capsys, command):
+    editor = Editor(open_scene(old_copy, device="cpu"))
     editor.recolor(red_apple(editor), (0, 0, 1))
     saved = editor.save(tmp_path / "saved").root
     before = modified(saved)
@@ -82,21 +82,21 @@ def test_a_rebuild_says_that_measurements_are_of_the_scene_before_it(tiny_captur
     assert told in caplog.text
 
 
-def test_steps_for_earlier_gaussians_are_said_to_be_worthless_and_not_to_be_saved(scene, capsys):
-    opened = open_scene(scene, device="cpu")
-    editor = Editor(opened, scene / "edits.jsonl")
+def test_steps_for_earlier_gaussians_are_said_to_be_worthless_and_not_to_be_saved(old_copy, capsys):
+    opened = open_scene(old_copy, device="cpu")
+    editor = Editor(opened, old_copy / "edits.jsonl")
     editor.recolor(red_apple(editor), (0, 0, 1))
-    folder = SceneFolder.open(scene)
+    folder = SceneFolder.open(old_copy)
     assert (unsaved_steps(folder), outdated_steps(folder)) == (1, 0)
     folder.record["stages"]["reconstruct"]["fingerprint"] = "of a later build"
     folder.save()
     assert (unsaved_steps(folder), outdated_steps(folder)) == (0, 1)
-    assert cli.main(["info", str(scene)]) == 0
+    assert cli.main(["info", str(old_copy)]) == 0
     told = capsys.readouterr()
-    discard = f"no longer fits the scene, which was built again; lexsplat edit {scene} discard removes it"
+    discard = f"no longer fits the scene, which was built again; lexsplat edit {old_copy} discard removes it"
     assert f"1, which {discard}" in told.out
     assert "save" not in told.out + told.err
-    assert cli.main(["export", str(scene), str(scene / "a.ply")]) == 0
+    assert cli.main(["export", str(old_copy), str(old_copy / "a.ply")]) == 0
     assert f"note: 1 step of lexsplat edit {discard}" in capsys.readouterr().err
 
 
@@ -114,20 +114,20 @@ def test_facts_of_an_edited_scene_are_those_of_its_files(tmp_path, capsys):
     assert f" edits {editor.steps[0]}; {editor.steps[1]}" in " ".join(capsys.readouterr().out.split())
 
 
-def test_info_describes_the_version_that_answers_and_names_the_rebuild(scene, tmp_path, capsys):
-    folder = SceneFolder.open(scene)
+def test_info_describes_the_version_that_answers_and_names_the_rebuild(old_copy, tmp_path, capsys):
+    folder = SceneFolder.open(old_copy)
     keep_previous(folder)
     folder.save()
     folder.reopen("language")
     folder.finish("reconstruct", "of a later build", 1.0, gaussians=3)
-    assert version_that_answers(SceneFolder.open(scene)).content == scene / "previous"
-    assert cli.main(["info", str(scene)]) == 0
+    assert version_that_answers(SceneFolder.open(old_copy)).content == old_copy / "previous"
+    assert cli.main(["info", str(old_copy)]) == 0
     told = " ".join(capsys.readouterr().out.split())
     assert "rebuild is at work or was interrupted: wait for it, or run the build again" in told
     assert "gaussians 400 " in told
-    assert cli.main(["info", str(scene), "--json"]) == 0
+    assert cli.main(["info", str(old_copy), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["rebuilding"] is True
-    for command in (["find", str(scene), "red apple"], ["export", str(scene), str(tmp_path / "a.ply")]):
+    for command in (["find", str(old_copy), "red apple"], ["export", str(old_copy), str(tmp_path / "a.ply")]):
         assert cli.main(command) == 0
         assert (
             "note: this is the scene before a rebuild, which is at work or was interr"

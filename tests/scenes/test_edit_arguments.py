@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from support.viewer_scene import ball_scene
+from support.viewer_scene import BallScene, ball_scene
 
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.editing import Editor, Motion
-from lexsplat.scenes.scene import Scene
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene() -> BallScene:
     return ball_scene()[0]
 
 

@@ -334,11 +334,21 @@ class _Builder:
         return {"gaussians": len(gaussians), **facts}
 
     def _extract_features(self) -> dict[str, Any]:
-        maps = self._feature_maps()
-        if self.config.features_from is not None:
+        maps, given = self._feature_maps(), self.config.features_from
+        if given is not None:
+            empty = 0
             for done, name in enumerate(maps, start=1):
-                _ = maps[name]  # reading checks them, before anything is made of them
+                # Reading checks them, before anything is made of them.
+                empty += not bool(maps[name].clip.any())
                 self.listener(Event("features", done, len(maps)))
+            if empty == len(maps):
+                raise FileFormatError(
+                    given, expected="segments in some photo", found="none in any", remedy="write them again"
+                )
+            if empty:
+                log.warning(
+                    "%s: %d of %d photos have no segment, and so no features", given, empty, len(maps)
+                )
         return {"views": len(maps), "clip_hash": self._clip_hash, "dino": self.config.uses_dino}
 
     def _fit_codebook(self) -> dict[str, Any]:
