@@ -1,6 +1,7 @@
 """The facts that every answer has: units, up, threshold, presence, best view, and the view of left and right."""
 
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -87,16 +88,16 @@ def test_one_scene_is_not_called_one_scenes():
 
 
 @pytest.fixture
-def with_a_step(tmp_path):
+def edited_table(tmp_path) -> Path:
     """A copy of the bundled scene with a step of an edit that no scene holds."""
     scene = shutil.copytree(BUNDLED_SCENE, tmp_path / "table")
     (scene / "edits.jsonl").write_text('{}\n{"kind": "recolor"}\n')
     return scene
 
 
-def test_every_answer_says_that_a_step_of_an_edit_is_not_in_the_scene(with_a_step, tmp_path):
-    server = make_server(open_scenes([str(with_a_step)]), tmp_path / "output")
-    told = f"Note: 1 step of lexsplat edit is not in this scene; lexsplat edit {with_a_step} save --output SCENE2"
+def test_every_answer_says_that_a_step_of_an_edit_is_not_in_the_scene(edited_table, tmp_path):
+    server = make_server(open_scenes([str(edited_table)]), tmp_path / "output")
+    told = f"Note: 1 step of lexsplat edit is not in this scene; lexsplat edit {edited_table} save --output SCENE2"
     for tool in ("find", "count", "describe_scene", "render", "export"):
         reply, text = ask(server, tool, **CALLS.get(tool, {}))
         assert text.count(told) == 1, tool
@@ -105,6 +106,6 @@ def test_every_answer_says_that_a_step_of_an_edit_is_not_in_the_scene(with_a_ste
     reply, text = ask(server, "list_scenes")
     assert text == "1 scene: table (1 unsaved step)."
     assert reply.structured_content["scenes"][0]["unsaved_steps"] == 1
-    (with_a_step / "edits.jsonl").unlink()
+    (edited_table / "edits.jsonl").unlink()
     reply, text = ask(server, "find", phrase="mug")
     assert (reply.structured_content["unsaved_steps"], "step" in text) == (0, False)

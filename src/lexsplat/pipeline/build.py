@@ -271,7 +271,7 @@ class _Builder:
             for path in stage.outputs:
                 self.folder.check_file(path)
         except FileFormatError as error:
-            log.warning("%s: %s; the stage %s runs again", error.subject, error.found, name)
+            log.warning("%s", error.with_remedy(f"the stage {name} runs again"))
             return False
         return True
 
@@ -313,7 +313,7 @@ class _Builder:
                 damaged = Path(error.subject)
                 if damaged.parent != self.folder.features_path or damaged in mended:
                     raise
-                log.warning("%s: %s; its features are made again", damaged, error.found)
+                log.warning("%s", error.with_remedy("they are made again"))
                 mended.add(damaged)
                 damaged.unlink(missing_ok=True)
                 self._maps = None  # made anew, it encodes the photos whose features are missing

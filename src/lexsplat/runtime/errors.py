@@ -7,6 +7,10 @@ arguments of Python functions raise ``ValueError``.
 from __future__ import annotations
 
 from functools import partial
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 STOPPED = "stopped; run the same command again to go on"
 """Message after Ctrl-C."""
@@ -42,6 +46,10 @@ class LexsplatError(Exception):
         if self.remedy:
             message = f"{message}; {self.remedy}"
         return " ".join(message.split())
+
+    def with_remedy(self, remedy: str) -> Self:
+        """The same error with other advice, from one who knows what the subject is used for."""
+        return type(self)(self.subject, expected=self.expected, found=self.found, remedy=remedy)
 
     def __reduce__(self) -> tuple:
         fields = {"expected": self.expected, "found": self.found, "remedy": self.remedy}

@@ -301,8 +301,7 @@ class SceneFolder:
         try:
             return read_ply(self.gaussians_path)
         except FileFormatError as error:  # whose advice is for a file of another program
-            facts = {"expected": error.expected, "found": error.found, "remedy": "run the build again"}
-            raise FileFormatError(error.subject, **facts) from error
+            raise error.with_remedy("run the build again") from error
 
     def _has_whole_gaussians(self) -> bool:
         """Whether ``gaussians.ply`` is known to be as it was written.

@@ -71,6 +71,10 @@ def read_scene(path: Path, device: str) -> SceneContent:
             return _read_content(version_that_answers(folder), device)
         except (SceneFolderError, FileFormatError) as error:
             if _state(SceneFolder.open(path)) == _state(folder):
+                if folder.record.get("edits"):  # a build is refused there
+                    raise error.with_remedy(
+                        "restore it from a copy, or edit and save the original again"
+                    ) from error
                 raise
             if attempts == _ATTEMPTS:  # a build in progress explains what is missing
                 raise SceneFolderError(

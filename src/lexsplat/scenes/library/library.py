@@ -205,9 +205,7 @@ class Library:
             remedy = f"if it was moved: {command('add', self.root, 'NEW_PLACE')}; if it is gone: {remove}"
             if (self.folder(record) / "scene.json").is_file():
                 remedy = f"{error.remedy or 'build it again'}, or: {remove}"
-            raise type(error)(
-                error.subject, expected=error.expected, found=error.found, remedy=remedy
-            ) from error
+            raise error.with_remedy(remedy) from error
 
     def scene(self, name: str) -> Scene:
         """A scene, as it is now.
