@@ -199,7 +199,9 @@ def test_wrong_usage_is_refused(capsys, arguments, told):
 
 
 def test_a_library_notes_once_that_steps_of_an_edit_are_not_in_a_scene(rooms, capsys):
-    (rooms / "kitchen" / "edits.jsonl").write_text('{}\n{"kind": "recolor"}\n')
+    made = json.loads((rooms / "kitchen" / "scene.json").read_text())["stages"]["reconstruct"]["fingerprint"]
+    header = json.dumps({"reconstruction": made})
+    (rooms / "kitchen" / "edits.jsonl").write_text(header + '\n{"kind": "recolor"}\n')
     told = "note: 1 step of lexsplat edit is not in this scene; lexsplat edit "
     for action, words in (("add", [rooms / "kitchen"]), ("search", ["mug", "mug"])):
         capsys.readouterr()

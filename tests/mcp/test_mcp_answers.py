@@ -1,5 +1,6 @@
 """The facts that every answer has: units, up, threshold, presence, best view, and the view of left and right."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -91,7 +92,8 @@ def test_one_scene_is_not_called_one_scenes():
 def edited_table(tmp_path) -> Path:
     """A copy of the bundled scene with a step of an edit that no scene holds."""
     scene = shutil.copytree(BUNDLED_SCENE, tmp_path / "table")
-    (scene / "edits.jsonl").write_text('{}\n{"kind": "recolor"}\n')
+    made = json.loads((scene / "scene.json").read_text())["stages"]["reconstruct"]["fingerprint"]
+    (scene / "edits.jsonl").write_text(json.dumps({"reconstruction": made}) + '\n{"kind": "recolor"}\n')
     return scene
 
 

@@ -15,12 +15,12 @@ from lexsplat.language.fields import CodeField
 from lexsplat.language.segments import Segments
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
-from lexsplat.scenes.colors import recolored
 from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.exporting import export_scene
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.journal import Step
+from lexsplat.scenes.recoloring import recolored
 from lexsplat.scenes.scene import Scene, open_scene
 from lexsplat.scenes.views import StoredView
 

@@ -181,9 +181,8 @@ class PresenceClassifier:
 
     @property
     def tables(self) -> dict[str, Tensor]:
-        """Tables for pages: objects as distributions ``[V, K]``, best heights for colors ``[K]``, fits of parts."""
-        places, fits = self.places.distributions, self.part_fits.T
-        return {"places": places, "best_colored": self._best_colored, "part_fits": fits}
+        """Tables for pages: distributions ``[V, K]`` of objects, and the best heights for colors ``[K]``."""
+        return {"places": self.places.distributions, "best_colored": self._best_colored}
 
     def strengths(self, texts: Tensor, places: Tensor) -> NDArray[np.float64]:
         """`Evidence.strength` of phrases ``[P, D]`` at places with distributions ``[V, K]``: ``[V, P]``."""

@@ -27,13 +27,14 @@ from lexsplat.queries.visibility import whole_things, with_remains
 from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.scenes.colors import parse_color, recolored
+from lexsplat.scenes.colors import parse_color
 from lexsplat.scenes.filling import Fill, fill_for
 from lexsplat.scenes.folder import SceneFolder, refuse_within_scene
 from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.gone import gone_nouns
 from lexsplat.scenes.journal import CHANGES, Journal, Kind, Step, packed, unpacked
 from lexsplat.scenes.kept import keep_for
+from lexsplat.scenes.recoloring import recolored
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.transforms import Motion, transformed
 

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from lexsplat.geometry.boxes import Box
 from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.part_names import NAMES as PART_NAMES
 from lexsplat.queries.presence import DescribedPlaces
 from lexsplat.queries.seen import MOST_VIEWS, Seen
 from lexsplat.queries.selection import Selection
@@ -92,7 +93,7 @@ def keep(scene: Scene) -> None:
         if words.shape[1] != scene.field.codebook.clip.shape[1]:
             return  # no question can be asked with this encoder
         classifier = scene.presence_classifier
-        scene.embed(classifier.colored or ["object"])
+        scene.embed([*PART_NAMES, *classifier.colored])
         if scene.kept is None and scene.field.segments is not None:
             _write_objects(
                 scene, KeptObjects(scene.objects, classifier.places), path.with_name("objects.safetensors")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lexsplat.captures.capture import stem_of
 from lexsplat.captures.images.undistortion import MAX_SIDE
 from lexsplat.captures.readers.camera_files import MAX_COORDINATE, checked_name
 from lexsplat.captures.splits import match_stem
@@ -34,7 +35,10 @@ def view_named(views: Mapping[str, StoredView], name: str) -> StoredView:
     if not isinstance(name, str):
         expected = "the name of a view, a StoredView or a Camera"
         raise QueryError("view", expected=expected, found=repr(name)[:60])
-    matches = match_stem(name, views)
+    # A suffix may be given where the views are stored without theirs.
+    matches = match_stem(name, views) or match_stem(
+        stem_of(name), (each for each in views if stem_of(each) == each)
+    )
     if len(matches) != 1:
         known = ", ".join(list(views)[:5])
         raise QueryError(

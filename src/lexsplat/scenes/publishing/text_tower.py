@@ -42,7 +42,9 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
     codewords = torch.nn.functional.normalize(scene.field.codebook.clip.detach().cpu().float(), dim=-1)
     tensors |= {"codewords": codewords, "mean": scene.everyday_scale.mean, "best": scene.everyday_scale.best}
     if scene.field.segments is not None:
-        tensors |= {name: table.float() for name, table in scene.presence_classifier.tables.items()}
+        classifier = scene.presence_classifier
+        tables = {**classifier.tables, "part_fits": classifier.part_fits.T}
+        tensors |= {name: table.float() for name, table in tables.items()}
     save_tensors(
         {name: tensor.contiguous().cpu() for name, tensor in tensors.items()},
         weights,
