@@ -176,6 +176,16 @@ def test_edits_of_the_bundled_scene_are_kept_in_the_working_directory(tmp_path, 
     assert {path: path.stat().st_mtime_ns for path in BUNDLED_SCENE.rglob("*")} == before
 
 
+@pytest.mark.slow
+def test_an_edit_of_what_the_scene_may_lack_says_so_and_how_to_take_it_back(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["edit", "demo", "recolor", "--select", "bear eye", "--color", "red"]) == 0
+    told = "note: bear eye: perhaps not in this scene; names of other parts fit this place better"
+    assert f"{told}; lexsplat edit demo undo takes the step back" in capsys.readouterr().err
+    assert cli.main(["edit", "demo", "recolor", "--select", "bear nose", "--color", "red"]) == 0
+    assert "perhaps" not in capsys.readouterr().err
+
+
 def test_discard_asks_before_it_deletes_steps(built, tmp_path, monkeypatch, capsys):
     copy = tmp_path / "scene"
     shutil.copytree(built, copy)

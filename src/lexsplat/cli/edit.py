@@ -6,12 +6,13 @@ import dataclasses
 import math
 import sys
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from lexsplat.cli.options import Device, SceneArgument, check_threshold, confirmed, open_scene
+from lexsplat.cli.options import PRESENCE, Device, SceneArgument, check_threshold, confirmed, open_scene
 from lexsplat.cli.values import Color
 from lexsplat.cli.waiting import starting
 from lexsplat.runtime.errors import QueryError
@@ -193,3 +194,7 @@ class Edit:
         motion = Motion(self.by, scale=self.scale, turn=self.turn)
         with uncounted(editor.original.listener, "steps"):
             editor.change(self.action, chosen, motion, self.color or (), self.strength, self.fill)
+        if chosen.present == "unsure" or chosen.note:
+            why = "; ".join(filter(None, (PRESENCE[chosen.present or "yes"].lstrip("; "), chosen.note)))
+            undo = f"lexsplat edit {quote(self.scene)} undo takes the step back"
+            print(f"note: {self.select}: {why}; {undo}", file=sys.stderr)
