@@ -198,6 +198,7 @@ class _Builder:
         self.method = config.language_method
         self.geometry = way_to_geometry(config, device, splats)
         self.fingerprints: dict[str, str] = {}
+        self._whole: dict[str, bool] = {}  # of the stages whose files were read
         self.checkpoint: Checkpoint | None = None
         self._maps: FeatureMaps | None = None
         self._clip_hash = ""
@@ -267,6 +268,12 @@ class _Builder:
             return False
         if not all(path.exists() for path in stage.outputs):
             return False
+        if name not in self._whole:
+            self._whole[name] = self._is_whole(name, stage)
+        return self._whole[name]
+
+    def _is_whole(self, name: str, stage: _Stage) -> bool:
+        """Whether the files of a stage are undamaged; a warning names the first one that is not."""
         try:
             for path in stage.outputs:
                 self.folder.check_file(path)
