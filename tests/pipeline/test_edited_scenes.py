@@ -15,7 +15,6 @@ from lexsplat import cli, open_scene
 from lexsplat.pipeline.build import build
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.scenes.editing import Editor
-from lexsplat.scenes.facts import scene_facts
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.previous import keep_previous, version_that_answers
 from lexsplat.scenes.unsaved import outdated_steps, unsaved_steps
@@ -98,20 +97,6 @@ def test_steps_for_earlier_gaussians_are_said_to_be_worthless_and_not_to_be_save
     assert "save" not in told.out + told.err
     assert cli.main(["export", str(old_copy), str(old_copy / "a.ply")]) == 0
     assert f"note: 1 step of lexsplat edit {discard}" in capsys.readouterr().err
-
-
-def test_facts_of_an_edited_scene_are_those_of_its_files(tmp_path, capsys):
-    opened = open_scene("demo", device="cpu")
-    editor = Editor(opened)
-    for thing in ("red apple", "mug"):
-        editor.delete(editor.scene.find(thing).largest())
-    saved = editor.save(tmp_path / "saved")
-    facts = scene_facts(SceneFolder.open(saved.root))
-    written = open_scene(saved.root, device="cpu").field
-    assert facts["segments"] == written.segments.levels.shape[1]
-    assert facts["edits"] == [str(step) for step in editor.steps]
-    assert cli.main(["info", str(saved.root)]) == 0
-    assert f" edits {editor.steps[0]}; {editor.steps[1]}" in " ".join(capsys.readouterr().out.split())
 
 
 def test_info_describes_the_version_that_answers_and_names_the_rebuild(old_copy, tmp_path, capsys):
