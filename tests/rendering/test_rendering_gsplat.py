@@ -182,7 +182,7 @@ def test_of_a_compiler_that_fails_the_errors_are_reported_and_everything_is_logg
             raise RuntimeError(output)
 
     monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", Backend("gsplat.cuda._backend"))
-    with caplog.at_level("DEBUG"), pytest.raises(BackendError) as caught:
+    with caplog.at_level("DEBUG", "lexsplat"), pytest.raises(BackendError) as caught:
         gsplat_backend.require_gsplat()
     assert "glm.hpp(12): fatal error: no such file or directory; install a wheel" in str(caught.value)
     assert len(caught.value.found) < 400

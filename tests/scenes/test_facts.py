@@ -11,8 +11,8 @@ from lexsplat.scenes.folder import SceneFolder
 def test_facts_of_an_edited_scene_are_those_of_its_files(tmp_path, capsys):
     opened = open_scene("demo", device="cpu")
     editor = Editor(opened)
-    for thing in ("red apple", "mug"):
-        editor.delete(editor.scene.find(thing).largest())
+    editor.delete(opened.find("red apple"))
+    editor.recolor(editor.scene.find("mug"), "red")
     saved = editor.save(tmp_path / "saved")
     facts = scene_facts(SceneFolder.open(saved.root))
     written = open_scene(saved.root, device="cpu").field
