@@ -318,8 +318,7 @@ def _images(scene: Scene, means: Tensor) -> dict[str, Any]:
     names, files, cameras = evenly(list(scene.views), _IMAGES), [], []
     seen = np.zeros(len(means), np.uint8)
     for number, name in enumerate(names):
-        camera = scene.camera(name)
-        camera = camera.downscaled(max(1.0, max(camera.width, camera.height) / _SIDE))
+        camera = scene.camera(name).within(_SIDE)
         drawn = render(scene.gaussians, camera, depth=True)
         pixels = (drawn.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
         file = io.BytesIO()
