@@ -110,12 +110,12 @@ def model_folder(name: str, tower: str) -> Path:
     return cached if cached is not None else _download(name, tower, lacking)
 
 
-def local_folder(name: str, tower: str) -> Path | None:
-    """The folder of a model if it is on this machine, complete or not; does not use the network."""
+def local_folder(name: str) -> Path | None:
+    """The folder of a CLIP model if it is on this machine, complete or not; does not use the network."""
     if present_name(name) == "bundled":
-        return BUNDLED_ENCODERS / tower
+        return BUNDLED_ENCODERS / "clip"
     folder = Path(name).expanduser()
-    return folder if folder.is_dir() else _cached_folder(name, tower)[0]
+    return folder if folder.is_dir() else _cached_folder(name, "clip")[0]
 
 
 def missing_part(folder: Path, tower: str) -> str:
