@@ -21,7 +21,7 @@ from typing import Any
 from lexsplat.features.weights import INDEX, WEIGHTS, first_weights, read_config, weight_files
 from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.errors import ModelError
-from lexsplat.runtime.files import atomic_path, free_bytes
+from lexsplat.runtime.files import free_bytes, write_file
 from lexsplat.runtime.fingerprints import blocks, digest
 from lexsplat.runtime.progress import NOTE
 
@@ -182,8 +182,8 @@ def content_hash(folder: Path, tower: str) -> str:
             return known
     found = digest((part for path in files for part in chain([path.name.encode()], blocks(path))), 16)
     if kept is not None and kept == _path_of_hash(files):  # no file has changed meanwhile
-        with contextlib.suppress(OSError), atomic_path(kept) as temporary:
-            temporary.write_text(found)
+        with contextlib.suppress(OSError):
+            write_file(kept, found)
     return found
 
 
