@@ -77,6 +77,12 @@ def test_downscaling_rounds_sizes_to_at_least_one_pixel():
         camera.downscaled(0)
 
 
+def test_a_longer_side_is_brought_within_a_limit_and_a_shorter_one_stays():
+    camera = Camera(799, 532, K, np.eye(4))
+    assert (camera.within(400).width, camera.within(400).height) == (400, 266)
+    assert (camera.within(800).width, camera.within(800).height) == (799, 532)
+
+
 def test_extent_is_the_radius_times_1_1_and_1_for_a_point():
     views = [look_at([r, 0, 0], [0, 9, 0], [0, 0, 1], 8, 8, 1.0) for r in (-2, 2)]
     assert camera_extent(views) == pytest.approx(2.2)

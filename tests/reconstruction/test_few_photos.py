@@ -22,7 +22,8 @@ def test_an_added_point_has_the_depth_of_the_nearest_known_point_in_its_photo_an
     name = capture.train_names[2]
     camera, photo = capture.views[name].camera, capture.views[name].load_image()
     one = dataclasses.replace(capture, train_names=(name,))
-    found = points_between(one, points, enough=camera.width * camera.height)
+    monkeypatch.setattr(few_photos, "ENOUGH_POINTS", camera.width * camera.height)
+    found = points_between(one, points)
     known = len(points.points)
     np.testing.assert_array_equal(found.points[:known], points.points)
     assert len(found.points) == camera.width * camera.height // 2
@@ -66,9 +67,9 @@ def test_no_point_is_added_under_a_mask(capture, points, monkeypatch):
     assert columns.min() > half - 1e-3
 
 
-def test_no_point_is_added_where_there_are_enough(capture, points):
-    enough = len(points.points)
-    np.testing.assert_array_equal(points_between(capture, points, enough=enough).points, points.points)
+def test_no_point_is_added_where_there_are_enough(capture, points, monkeypatch):
+    monkeypatch.setattr(few_photos, "ENOUGH_POINTS", len(points.points))
+    np.testing.assert_array_equal(points_between(capture, points).points, points.points)
 
 
 def test_many_photos_start_from_the_known_points_alone(capture, monkeypatch, caplog):

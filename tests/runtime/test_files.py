@@ -10,7 +10,15 @@ import torch
 
 from lexsplat.runtime import files
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.runtime.files import atomic_path, naming, read_json, read_tensors, write_json, write_tensors
+from lexsplat.runtime.files import (
+    atomic_path,
+    naming,
+    read_json,
+    read_tensors,
+    write_file,
+    write_json,
+    write_tensors,
+)
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -191,3 +199,11 @@ def test_the_free_space_of_a_folder_is_that_of_its_disk_and_of_the_limit_of_file
         assert files.free_bytes(tmp_path) == 12_345
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_text_is_written_in_utf_8_and_bytes_as_they_are(tmp_path):
+    write_file(tmp_path / "new" / "text", "ä\n")
+    write_file(tmp_path / "new" / "bytes", b"\xff\r\n")
+    assert (tmp_path / "new" / "text").read_bytes() == b"\xc3\xa4\n"
+    assert (tmp_path / "new" / "bytes").read_bytes() == b"\xff\r\n"
+    assert len(list((tmp_path / "new").iterdir())) == 2

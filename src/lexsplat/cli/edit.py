@@ -35,19 +35,18 @@ _OPTIONS = {
     "discard": ("yes",),
 }
 """Options of single actions."""
-Action = tyro.conf.Positional[
-    Annotated[
-        str,
-        PrimitiveConstructorSpec(
-            nargs=1,
-            metavar="{" + ",".join(ACTIONS) + "}",
-            instance_from_str=lambda words: words[0].replace("colour", "color"),
-            is_instance=lambda value: value in ACTIONS,
-            str_from_instance=lambda value: [value],
-            choices=(*ACTIONS, "recolour"),
-        ),
-        tyro.conf.arg(help_behavior_hint="(required)"),
-    ]
+Action = Annotated[
+    str,
+    tyro.conf.Positional,
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="{" + ",".join(ACTIONS) + "}",
+        instance_from_str=lambda words: words[0].replace("colour", "color"),
+        is_instance=lambda value: value in ACTIONS,
+        str_from_instance=lambda value: [value],
+        choices=(*ACTIONS, "recolour"),
+    ),
+    tyro.conf.arg(help_behavior_hint="(required)"),
 ]
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from lexsplat.cli.options import Device, check_phrases, note_version, print_json
+from lexsplat.cli.options import Device, check_phrases, named, note_version, print_json
 from lexsplat.cli.waiting import LateProgress, starting
 from lexsplat.runtime.errors import FileFormatError, LibraryError, ModelError, SceneFolderError
 from lexsplat.runtime.progress import Event
@@ -20,20 +20,15 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("lexsplat")
 
-_REQUIRED = "(required)"
 _FOR = {"repair": ("verify",), "confirm": ("search",), "thumbnails": ("search",)}
 """Options that belong to some actions only."""
-Action = tyro.conf.Positional[
-    Annotated[
-        Literal["add", "search", "list", "remove", "verify"], tyro.conf.arg(help_behavior_hint=_REQUIRED)
-    ]
+Action = Annotated[
+    Literal["add", "search", "list", "remove", "verify"],
+    tyro.conf.Positional,
+    tyro.conf.arg(help_behavior_hint="(required)"),
 ]
-LibraryArgument = tyro.conf.Positional[
-    Annotated[Path, tyro.conf.arg(metavar="LIB", help_behavior_hint=_REQUIRED)]
-]
-Words = tyro.conf.Positional[
-    Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE|PHRASE ...", help_behavior_hint="")]
-]
+LibraryArgument = Annotated[Path, tyro.conf.Positional, named("LIB")]
+Words = Annotated[tuple[str, ...], tyro.conf.Positional, named("SCENE|PHRASE ...", "")]
 
 
 @dataclasses.dataclass

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
-from lexsplat.cli.options import Device
+from lexsplat.cli.options import Device, named
 from lexsplat.cli.waiting import LateProgress, starting
 from lexsplat.runtime.errors import BackendError, LibraryError
 from lexsplat.runtime.progress import uncounted
@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from lexsplat.scenes.library import Library
     from lexsplat.scenes.serving import OpenScene
 
-Scenes = tyro.conf.Positional[
-    Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE ...", help_behavior_hint="(required)")]
-]
+Scenes = Annotated[tuple[str, ...], tyro.conf.Positional, named("SCENE ...")]
 
 
 @dataclasses.dataclass

@@ -25,25 +25,20 @@ PromptListName = Literal["paper", "released"]
 ProtocolName = Literal["strict", "official", "lerf-2d", "lerf-3d"]
 ALL_PROTOCOLS: tuple[ProtocolName, ...] = ("strict", "official", "lerf-2d", "lerf-3d")
 
-_REQUIRED = "(required)"
-SceneArgument = tyro.conf.Positional[
-    Annotated[str, tyro.conf.arg(metavar="SCENE", help_behavior_hint=_REQUIRED)]
+
+def named(placeholder: str, hint: str = "(required)") -> Any:
+    """Placeholder of a positional argument, and what the help page says of its default."""
+    return tyro.conf.arg(metavar=placeholder, help_behavior_hint=hint)
+
+
+SceneArgument = Annotated[str, tyro.conf.Positional, named("SCENE")]
+CaptureArgument = Annotated[str, tyro.conf.Positional, named("CAPTURE")]
+OptionalCaptureArgument = Annotated[str, tyro.conf.Positional, named("[CAPTURE]", "(default: none)")]
+MoreCapturesArgument = Annotated[
+    tuple[str, ...], tyro.conf.Positional, named("[CAPTURE ...]", "(default: none)")
 ]
-CaptureArgument = tyro.conf.Positional[
-    Annotated[str, tyro.conf.arg(metavar="CAPTURE", help_behavior_hint=_REQUIRED)]
-]
-OptionalCaptureArgument = tyro.conf.Positional[
-    Annotated[str, tyro.conf.arg(metavar="[CAPTURE]", help_behavior_hint="(default: none)")]
-]
-MoreCapturesArgument = tyro.conf.Positional[
-    Annotated[tuple[str, ...], tyro.conf.arg(metavar="[CAPTURE ...]", help_behavior_hint="(default: none)")]
-]
-PhrasesArgument = tyro.conf.Positional[
-    Annotated[tuple[str, ...], tyro.conf.arg(metavar="PHRASE ...", help_behavior_hint=_REQUIRED)]
-]
-FileArgument = tyro.conf.Positional[
-    Annotated[Path, tyro.conf.arg(metavar="FILE", help_behavior_hint=_REQUIRED)]
-]
+PhrasesArgument = Annotated[tuple[str, ...], tyro.conf.Positional, named("PHRASE ...")]
+FileArgument = Annotated[Path, tyro.conf.Positional, named("FILE")]
 
 PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probably not in this scene"}
 """Text printed after an answer, by its value of ``present``."""

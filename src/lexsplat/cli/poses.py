@@ -12,12 +12,11 @@ import tyro
 
 from lexsplat.captures.readers.video import DEFAULT_FRAMES
 from lexsplat.captures.sfm.photos import PoseConfig
+from lexsplat.cli.options import named
 from lexsplat.runtime.device import check_seed
 from lexsplat.runtime.memory import parse_bytes
 
-PhotosArgument = tyro.conf.Positional[
-    Annotated[Path, tyro.conf.arg(metavar="CAPTURE", help_behavior_hint="(required)")]
-]
+PhotosArgument = Annotated[Path, tyro.conf.Positional, named("CAPTURE")]
 
 
 @dataclasses.dataclass

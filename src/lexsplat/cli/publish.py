@@ -9,13 +9,11 @@ from typing import Annotated, ClassVar
 
 import tyro
 
-from lexsplat.cli.options import Device, SceneArgument, open_scene
+from lexsplat.cli.options import Device, SceneArgument, named, open_scene
 from lexsplat.cli.waiting import starting
 from lexsplat.runtime.errors import SceneFolderError
 
-FolderArgument = tyro.conf.Positional[
-    Annotated[Path, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="(required)")]
-]
+FolderArgument = Annotated[Path, tyro.conf.Positional, named("FOLDER")]
 
 
 @dataclasses.dataclass

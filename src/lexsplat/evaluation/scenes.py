@@ -20,7 +20,7 @@ from lexsplat.evaluation.results import Metrics
 from lexsplat.pipeline.inputs import reload_capture
 from lexsplat.runtime.environment import machine_facts
 from lexsplat.runtime.errors import CaptureError, SceneFolderError
-from lexsplat.runtime.files import atomic_path, read_json, require_writable, write_json
+from lexsplat.runtime.files import read_json, require_writable, write_file, write_json
 from lexsplat.runtime.fingerprints import file_hash
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.answers import file_name
@@ -146,8 +146,7 @@ def _write_results(root: Path, metrics: Metrics, gallery: Gallery, title: str) -
     write_report(root / "report.html", metrics, gallery, title=title)
     for (view, prompt), images in gallery.cases.items():
         path = root / "heatmaps" / file_name(prompt) / f"{stem_of(view)}.jpg"
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(images["heatmap"])
+        write_file(path, images["heatmap"])
 
 
 def _registration(record: dict[str, Any]) -> dict[str, str]:

@@ -276,7 +276,7 @@ def patch_grid(name: str) -> int:
 
     0 for architectures without patch-level embeddings, and for a model that is not on this machine.
     """
-    folder = local_folder(name, "clip")
+    folder = local_folder(name)
     try:
         config = json.loads((folder / "config.json").read_text()) if folder else {}
         vision = config.get("vision_config") or {}

@@ -21,7 +21,7 @@ from typing import Any
 from lexsplat.features.weights import INDEX, WEIGHTS, first_weights, read_config, weight_files
 from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.errors import ModelError
-from lexsplat.runtime.files import atomic_path, free_bytes
+from lexsplat.runtime.files import free_bytes, write_file
 from lexsplat.runtime.fingerprints import blocks, digest
 from lexsplat.runtime.progress import NOTE
 
@@ -110,12 +110,12 @@ def model_folder(name: str, tower: str) -> Path:
     return cached if cached is not None else _download(name, tower, lacking)
 
 
-def local_folder(name: str, tower: str) -> Path | None:
-    """The folder of a model if it is on this machine, complete or not; does not use the network."""
+def local_folder(name: str) -> Path | None:
+    """The folder of a CLIP model if it is on this machine, complete or not; does not use the network."""
     if present_name(name) == "bundled":
-        return BUNDLED_ENCODERS / tower
+        return BUNDLED_ENCODERS / "clip"
     folder = Path(name).expanduser()
-    return folder if folder.is_dir() else _cached_folder(name, tower)[0]
+    return folder if folder.is_dir() else _cached_folder(name, "clip")[0]
 
 
 def missing_part(folder: Path, tower: str) -> str:
@@ -182,8 +182,8 @@ def content_hash(folder: Path, tower: str) -> str:
             return known
     found = digest((part for path in files for part in chain([path.name.encode()], blocks(path))), 16)
     if kept is not None and kept == _path_of_hash(files):  # no file has changed meanwhile
-        with contextlib.suppress(OSError), atomic_path(kept) as temporary:
-            temporary.write_text(found)
+        with contextlib.suppress(OSError):
+            write_file(kept, found)
     return found
 
 

@@ -127,15 +127,14 @@ def fit_box(points: NDArray, up: NDArray, spreads: NDArray | None = None) -> Box
     return _box(np.minimum(low, fewest_low + near), np.maximum(high, fewest_high - near), axes)
 
 
-def representatives(weights: NDArray, count: int = SAMPLE) -> NDArray[np.intp]:
-    """Indices of points that stand for all in `fit_box`: each is there as often as it weighs.
+def representatives(weights: NDArray) -> NDArray[np.intp]:
+    """Indices of points that stand for all in `fit_box`, at most `SAMPLE`: each is there as often as it weighs.
 
     Args:
-        weights: Weight of each point ``[M]``, not negative, M > 0.
-        count: Most indices; at most two for each point.
+        weights: Weight of each point ``[M]``, not negative, M > 0; there are at most two indices for each point.
     """
     reached = np.cumsum(np.asarray(weights, dtype=np.float64))
-    count = min(count, 2 * len(reached))
+    count = min(SAMPLE, 2 * len(reached))
     steps = (np.arange(count) + 0.5) / count * reached[-1]
     return np.searchsorted(reached, steps).clip(0, len(reached) - 1)
 

@@ -119,6 +119,10 @@ class Camera:
             raise ValueError(f"downscale must be positive, got {factor:g}")
         return self.resized(max(1, round(self.width / factor)), max(1, round(self.height / factor)))
 
+    def within(self, side: int) -> Camera:
+        """The same camera, downscaled if its longer side exceeds ``side`` pixels."""
+        return self.downscaled(max(1.0, max(self.width, self.height) / side))
+
 
 def _whole(name: str, value: object) -> int:
     """A size as an ``int``, whichever type of number states it."""

@@ -5,7 +5,6 @@ Dimension letters: N Gaussians, K codes, L levels, S lowest segments, V segments
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +15,6 @@ from torch import Tensor
 
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.segments import Segments
-
-_ROWS = 1 << 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,41 +35,15 @@ class SegmentCodes:
 
 
 @torch.no_grad()
-def segment_codes(segments: Segments, probabilities: Callable[[Tensor], Tensor]) -> SegmentCodes:
-    """The language of the segments of a field.
-
-    Args:
-        segments: The segments of N Gaussians.
-        probabilities: Distributions over the codes ``[n, K]`` of the Gaussians given by an index ``[n]``.
-    """
-    labels, weights = segments.labels.cpu().numpy(), segments.masses.cpu().double().numpy()
-    lowest, sums = segments.levels.shape[1], None
-    for index in torch.arange(len(labels)).split(_ROWS):
-        rows, place = probabilities(index).cpu().double().numpy(), index.numpy()
-        spread = csr_array((weights[place], (labels[place], np.arange(len(place)))), (lowest, len(place)))
-        sums = spread @ rows + (0.0 if sums is None else sums)
-    if sums is None:
-        return _empty(segments)
-    return _from_sums(segments, sums)
+def codes_of_field(field: LanguageField, segments: Segments) -> SegmentCodes:
+    """The language of segments of the Gaussians of a field."""
+    return segment_codes(segments, field.sums(segments.labels, segments.masses, segments.levels.shape[1]))
 
 
-@torch.no_grad()
-def codes_of_field(field: LanguageField) -> SegmentCodes:
-    """`segment_codes` of a field that has segments."""
-    segments = field.segments
-    if segments is None:
-        raise ValueError("the field has no segments")
-    if not len(segments.labels):
-        return _empty(segments)
-    return _from_sums(segments, field.sums(segments.labels, segments.masses, segments.levels.shape[1]))
-
-
-def _empty(segments: Segments) -> SegmentCodes:
-    return SegmentCodes(np.zeros((len(segments.levels), 0), np.int64), torch.zeros(0, 1), np.zeros(0))
-
-
-def _from_sums(segments: Segments, sums: NDArray[np.float64]) -> SegmentCodes:
+def segment_codes(segments: Segments, sums: NDArray[np.float64]) -> SegmentCodes:
     """The language of segments from the weighted sums over the lowest ones ``[S, K]``."""
+    if not len(segments.labels):
+        return SegmentCodes(np.zeros((len(segments.levels), 0), np.int64), torch.zeros(0, 1), np.zeros(0))
     labels, weights = segments.labels.cpu().numpy(), segments.masses.cpu().double().numpy()
     levels, lowest = segments.levels.cpu().numpy(), segments.levels.shape[1]
     masses = np.bincount(labels, weights, lowest).astype(np.float64)

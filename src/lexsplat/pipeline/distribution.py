@@ -17,7 +17,7 @@ from lexsplat.pipeline.encoding import Encoders
 from lexsplat.pipeline.provenance import with_full_paths
 from lexsplat.pipeline.scene_progress import LastEvent, named, named_messages, relayed
 from lexsplat.runtime.errors import CaptureError
-from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.files import write_file
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.workers import Needs, Outcome, SharedFolder, Workers, raise_failures
 
@@ -63,8 +63,7 @@ def extract_on_workers(
                 failed.append(outcome)
                 continue
             for name, content in outcome.result.items():
-                with atomic_path(cache.path / name) as temporary:
-                    temporary.write_bytes(content)
+                write_file(cache.path / name, content)
             done += len(missing[outcome.name])
             listener(Event("features", done, len(capture.views), workers.metrics))
     raise_failures(failed)

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.files import write_file
 from lexsplat.runtime.progress import Event, Listener
 
 _WRITE_SECONDS = 1.0
@@ -59,11 +59,8 @@ class LastEvent:
             return
         self._stage, self._written = event.stage, now
         values = [event.stage, event.done, event.total, dict(event.metrics)]
-        with (
-            contextlib.suppress(OSError),
-            atomic_path(self._path) as temporary,
-        ):  # progress is worth no failure
-            temporary.write_text(json.dumps(values), encoding="utf-8")
+        with contextlib.suppress(OSError):  # progress is worth no failure
+            write_file(self._path, json.dumps(values))
 
 
 @contextmanager

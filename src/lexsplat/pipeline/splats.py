@@ -81,7 +81,7 @@ def check_agreement(gaussians: Gaussians, views: list[View], subject: Path) -> N
     """
     shares, agreements = [], []
     for view in evenly(views, CHECKED_VIEWS):
-        camera = view.camera.downscaled(max(1.0, max(view.camera.width, view.camera.height) / 96))
+        camera = view.camera.within(96)
         with torch.no_grad():
             found = render(gaussians, camera, color=True)
         alpha = found.alpha.cpu().numpy()

@@ -40,6 +40,6 @@ def promising_views(selection: Selection) -> list[str]:
 @torch.no_grad()
 def visible_share(selection: Selection, camera: Camera) -> float:
     """Share of the image that the selection covers, with occlusion."""
-    small = camera.downscaled(max(1.0, max(camera.width, camera.height) / _LONG_SIDE))
+    small = camera.within(_LONG_SIDE)
     carried = selection.mask[:, None].float()
     return float(render(selection.gaussians, small, features=carried, color=False).features.mean())

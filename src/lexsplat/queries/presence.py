@@ -131,7 +131,7 @@ class PresenceClassifier:
         segments = self.language.segments
         if segments is None or len(self._shown) == 0:
             return None
-        return codes_of_field(self.language)
+        return codes_of_field(self.language, segments)
 
     @torch.no_grad()
     def best_heights(self, phrases: Sequence[str]) -> Tensor:

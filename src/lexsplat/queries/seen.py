@@ -139,8 +139,7 @@ class Seen:
         place = self._names.index(name)
         with self._working:
             if not self._known[place]:
-                camera = self._cameras[name]
-                small = camera.downscaled(max(1.0, max(camera.width, camera.height) / _LONG_SIDE))
+                small = self._cameras[name].within(_LONG_SIDE)
                 with torch.no_grad():
                     weights = accumulate_weights(self._gaussians, small).cpu().numpy()
                 covered = np.bincount(self._labels, weights, len(self._shares))

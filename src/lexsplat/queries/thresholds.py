@@ -115,10 +115,7 @@ def scene_thresholds(
     """
     if not cameras:
         raise ValueError("an automatic threshold needs at least one camera")
-    maps = []
-    for camera in evenly(cameras, THRESHOLD_VIEWS):
-        small = camera.downscaled(max(1.0, max(camera.width, camera.height) / _LONG_SIDE))
-        maps.append(relevancy(small).flatten(1).cpu())
+    maps = [relevancy(view.within(_LONG_SIDE)).flatten(1).cpu() for view in evenly(cameras, THRESHOLD_VIEWS)]
     found = automatic_threshold(torch.cat(maps, dim=1))
     absent = torch.tensor(
         [presence == "no" for presence in presences or ["yes"] * len(found)], dtype=torch.bool

@@ -39,7 +39,7 @@ from lexsplat.reconstruction.settings import REFERENCE_ITERATIONS, Reconstructio
 from lexsplat.reconstruction.surroundings import Surroundings
 from lexsplat.reconstruction.trainer import Reconstructor, initial_gaussians
 from lexsplat.runtime import memory as budget
-from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.files import write_file
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.workers import IN_PROCESS, Needs, SharedFolder, Workers, results
@@ -283,8 +283,7 @@ def reconstruct_blocks(
             found = results(workers.map(_visit, shared, items, needs))
             for done, (number, size, content) in enumerate(found, group[0].number + 1):
                 if content:
-                    with atomic_path(files.path(number)) as path:
-                        path.write_bytes(content)
+                    write_file(files.path(number), content)
                 listener(Event("blocks", done, total, {"gaussians": float(size), **workers.metrics}))
             files.remove_old(index + 1)
         latest = files.latest(len(groups))

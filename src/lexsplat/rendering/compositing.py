@@ -18,7 +18,7 @@ NEAR = 0.01
 """Default distance of the near plane in world units; Gaussians in front of it are not drawn."""
 
 
-def prepare(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> PreparedView:
+def prepare(gaussians: Gaussians, camera: Camera) -> PreparedView:
     """Project and sort once, for many calls of `render` or `back_project` with the same geometry.
 
     The result does not follow later changes of the Gaussians and passes no gradients to their geometry.
@@ -26,11 +26,10 @@ def prepare(gaussians: Gaussians, camera: Camera, *, near: float = NEAR) -> Prep
     Args:
         gaussians: The scene.
         camera: The view.
-        near: Distance of the near plane in world units.
     """
     module = backends.backend_for(gaussians)
     with torch.no_grad():
-        projection = module.project(gaussians, camera, near)
+        projection = module.project(gaussians, camera, NEAR)
         return PreparedView(module.__name__, projection, module.find_tiles(projection, camera), camera)
 
 
@@ -64,7 +63,7 @@ def render(
         depth: Whether to render the mean depth.
         viewmat: World to camera ``[4, 4]`` that replaces the camera's own and receives a gradient. It must be rigid,
             and its gradient is valid for rigid changes (rotation and translation).
-        prepared: From `prepare` for the same Gaussians and camera; ``near`` is then that of `prepare`.
+        prepared: From `prepare` for the same Gaussians and camera; ``near`` is then `NEAR`.
 
     Raises:
         ValueError: If an argument has a wrong shape, or the prepared view belongs to another camera.

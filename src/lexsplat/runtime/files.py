@@ -54,6 +54,12 @@ def atomic_path(path: Path, lasting: bool = True) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file as `atomic_path` does; a text in UTF-8."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+
+
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
     """Errors of the system in the block name ``path``, not nothing and not a temporary ``.NAME.*`` beside it."""
@@ -182,8 +188,7 @@ def write_json(path: Path, data: Any) -> None:
         ValueError: If it holds NaN or infinity, which are not JSON.
     """
     text = json.dumps(to_json(data), indent=2, allow_nan=False, ensure_ascii=False)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_file(path, text + "\n")
 
 
 def read_json(path: Path, *, remedy: str = "") -> Any:

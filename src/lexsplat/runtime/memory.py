@@ -51,6 +51,11 @@ GAUSSIAN_BYTES = 1_700
 """Bytes per Gaussian in training: parameters, gradient, two optimizer moments and the last valid state."""
 
 
+def kept_bytes(memory: int) -> int:
+    """Bytes of a budget that results kept from step to step may take: a quarter, and at most 1 GiB."""
+    return min(1 << 30, memory // 4)
+
+
 def photo_bytes(photo: tuple[int, int], made: tuple[int, int] = (0, 0)) -> int:
     """Memory to read, rotate, undistort, mask and resize one photo.
 

@@ -181,7 +181,7 @@ def looked_up(
     colors = np.zeros((len(places), 3))
     thing = torch.from_numpy(gone)[:, None].to(gaussians.means)
     for camera in evenly(cameras, _VIEWS):
-        small = _small(camera)
+        small = camera.within(_LONG_SIDE)
         with torch.no_grad():
             view = render(gaussians, small, features=thing, depth=True)
         nearest = cast(torch.Tensor, view.depth).cpu().numpy()
@@ -202,12 +202,8 @@ def seen_weights(gaussians: Gaussians, kept: Mask, cameras: Sequence[Camera]) ->
     """Visible weights of some Gaussians, drawn without the others, in some of the views, in their pixels ``[N]``."""
     drawn, weights = gaussians.select(torch.from_numpy(kept).to(gaussians.device)), np.zeros(len(kept))
     for camera in evenly(cameras, _VIEWS):
-        weights[kept] += accumulate_weights(drawn, _small(camera)).cpu().double().numpy()
+        weights[kept] += accumulate_weights(drawn, camera.within(_LONG_SIDE)).cpu().double().numpy()
     return weights
-
-
-def _small(camera: Camera) -> Camera:
-    return camera.downscaled(max(1.0, max(camera.width, camera.height) / _LONG_SIDE))
 
 
 def from_above(

@@ -117,10 +117,7 @@ def _without_options() -> Iterator[None]:
     try:
         yield
     except SceneFolderError as error:
-        remedy = "put the photos back where the build found them"
-        raise SceneFolderError(
-            error.subject, expected=error.expected, found=error.found, remedy=remedy
-        ) from error
+        raise error.with_remedy("put the photos back where the build found them") from error
 
 
 def _photos(session: Session) -> Callable[[Request], Awaitable[Response]]:

@@ -21,7 +21,7 @@ from PIL import Image
 
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import BackendError, CaptureError
-from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.files import atomic_path, write_file
 from lexsplat.runtime.fingerprints import digest
 from lexsplat.runtime.progress import Event, Listener, silent
 
@@ -122,8 +122,7 @@ def sample_video(
         if stale.name not in names:
             stale.unlink()
     _write_frames(video, folder, dict(zip(chosen, names)), len(motion), memory, listener)
-    with atomic_path(folder / _MANIFEST) as temporary:
-        temporary.write_text(json.dumps({**inputs, "names": names}, indent=1), encoding="utf-8")
+    write_file(folder / _MANIFEST, json.dumps({**inputs, "names": names}, indent=1))
     return names
 
 

@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from PIL import Image
 
@@ -155,16 +155,9 @@ def match_photos(
     """Match ``count`` photos, all pairs or each with the next ones, and verify the matches."""
     if config.compares_all(count):
         matching, held = matching_plan(database, memory, least=2 * budget.CACHED_BLOCKS)
-        with counted_pairs(database, count * (count - 1) // 2, listener):
-            pycolmap.match_exhaustive(
-                database,
-                matching_options=matching,
-                pairing_options=pycolmap.ExhaustivePairingOptions(
-                    block_size=min(50, held // budget.CACHED_BLOCKS)
-                ),
-                verification_options=_verification(seed),
-                device=pycolmap.Device.cpu,
-            )
+        every = pycolmap.ExhaustivePairingOptions(block_size=min(50, held // budget.CACHED_BLOCKS))
+        pairs = count * (count - 1) // 2
+        _match(pycolmap.match_exhaustive, database, matching, every, pairs, seed, listener)
         return
     # Quadratic overlap adds photos 2, 4, 8, ... further on, which closes loops.
     pairing = pycolmap.SequentialPairingOptions(overlap=SEQUENTIAL_OVERLAP, quadratic_overlap=True)
@@ -172,14 +165,7 @@ def match_photos(
         pairing.loop_detection_num_images = 1
     matching, _ = matching_plan(database, memory, least=budget.SEQUENTIAL_BLOCKS * SEQUENTIAL_OVERLAP)
     pairs = sum(max(0, count - (1 << power)) for power in range(SEQUENTIAL_OVERLAP))
-    with counted_pairs(database, pairs, listener):
-        pycolmap.match_sequential(
-            database,
-            matching_options=matching,
-            pairing_options=pairing,
-            verification_options=_verification(seed),
-            device=pycolmap.Device.cpu,
-        )
+    _match(pycolmap.match_sequential, database, matching, pairing, pairs, seed, listener)
 
 
 def match_leftover(
@@ -204,20 +190,24 @@ def match_pairs(
     listed.write_text("".join(f"{first} {second}\n" for first, second in sorted(pairs)), encoding="utf-8")
     matching, held = matching_plan(database, memory)
     matching.skip_geometric_verification = seed is None
-    with counted_pairs(database, len(pairs), listener):
-        pycolmap.match_image_pairs(
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=listed, block_size=held)
+    _match(pycolmap.match_image_pairs, database, matching, pairing, len(pairs), seed or 0, listener)
+
+
+def _match(
+    run: Callable[..., None], database: Path, plan: Any, pairing: Any, pairs: int, seed: int, listener: Pairs
+) -> None:
+    """Match by a function of pycolmap, and verify the matches."""
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    with counted_pairs(database, pairs, listener):
+        run(
             database,
-            matching_options=matching,
-            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed, block_size=held),
-            verification_options=_verification(seed or 0),
+            matching_options=plan,
+            pairing_options=pairing,
+            verification_options=verification,
             device=pycolmap.Device.cpu,
         )
-
-
-def _verification(seed: int) -> pycolmap.TwoViewGeometryOptions:
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = seed
-    return options
 
 
 def map_photos(

@@ -21,7 +21,7 @@ from lexsplat.captures.sfm.feature_budget import check_mapping
 from lexsplat.captures.sfm.preparation import PreparedPhotos, photo_folder, prepare_photos
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError
-from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.files import write_file
 from lexsplat.runtime.fingerprints import file_stamp, fingerprint
 from lexsplat.runtime.progress import Event, FirstUnits, Listener, silent, uncounted
 
@@ -290,8 +290,7 @@ def _work_folder(output: Path, photos: PreparedPhotos, config: PoseConfig, seed:
     note = work / "source.txt"
     if not (note.is_file() and note.read_text() == key):
         shutil.rmtree(work, ignore_errors=True)
-        with atomic_path(note) as temporary:
-            temporary.write_text(key)
+        write_file(note, key)
     return work
 
 

@@ -19,16 +19,13 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.relevancy import Question, pairwise_relevancy
 from lexsplat.rendering import PreparedView, accumulate_weights, back_project, prepare, render
-from lexsplat.runtime.memory import DEFAULT_MEMORY
+from lexsplat.runtime.memory import DEFAULT_MEMORY, kept_bytes
 
 CHANNELS = 32
 """Feature channels rendered in one pass."""
 
 MIN_WEIGHT = 0.01
 """A Gaussian with less weight than this over all views, in pixels, counts as never seen."""
-
-MAX_STORE = 1 << 30
-"""Upper bound in bytes for the projections that are kept."""
 
 LevelMaps = Callable[[str], tuple[Tensor, list[float]]]
 """The CLIP map of each crop size of a view ``[L, h, w, D]``, and their sides as fractions of the image's width."""
@@ -57,14 +54,14 @@ class TrainingViews:
     Args:
         data: Geometry, cameras and maps.
         scale: Rendered pixels per cell along a side; never more than the camera has.
-        memory: Memory budget in bytes, a quarter of it for projections; results do not depend on it.
+        memory: Memory budget in bytes, `kept_bytes` of it for projections; results do not depend on it.
     """
 
     def __init__(self, data: TrainingData, *, scale: int = 1, memory: int = DEFAULT_MEMORY) -> None:
         self.gaussians = data.gaussians.detach()
         self.names = sorted(data.cameras)
         self._cameras, self._maps, self._scale = data.cameras, data.maps, scale
-        self._limit, self._kept = min(MAX_STORE, memory // 4), dict[str, PreparedView]()
+        self._limit, self._kept = kept_bytes(memory), dict[str, PreparedView]()
 
     def prepared(self, name: str) -> tuple[Camera, PreparedView]:
         """Camera and projection of a view at the rendered size."""

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lexsplat.evaluation.report.templating import latex_table, number, size_text, write_text
+from lexsplat.evaluation.report.templating import latex_table, number, size_text
+from lexsplat.runtime.files import write_file
 
 COLUMNS = ("mIoU", "mPA", "mP", "mAP")
 
@@ -229,8 +230,8 @@ def write_rows(folder: Path, stem: str, rows: Sequence[Row], keys: Sequence[str]
 
     The LaTeX table has the columns of the paper's Table 1, or ``keys`` of them.
     """
-    write_text(folder / f"{stem}.csv", csv_text(rows))
-    write_text(folder / f"{stem}.tex", latex_text(rows, keys))
+    write_file(folder / f"{stem}.csv", csv_text(rows))
+    write_file(folder / f"{stem}.tex", latex_text(rows, keys))
 
 
 def csv_text(rows: Sequence[Row]) -> str:

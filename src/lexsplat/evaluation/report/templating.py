@@ -19,7 +19,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from numpy.typing import NDArray
 from PIL import Image
 
-from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.files import write_file
 
 
 def write_page(path: Path, template: str, content: Mapping[str, Any], views: Mapping[str, Any]) -> None:
@@ -39,13 +39,7 @@ def write_page(path: Path, template: str, content: Mapping[str, Any], views: Map
         "provenance": _provenance(content["config"], content["machine"]),
         "documents": {name: content[name] for name in ("machine", "config")},
     }
-    write_text(path, environment().get_template(template).render(variables))
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_file(path, environment().get_template(template).render(variables))
 
 
 def latex_table(headings: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> str:

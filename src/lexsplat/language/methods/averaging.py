@@ -39,10 +39,6 @@ SHARD_VIEWS = 16
 MOST_SHARDS = 64
 """Shards of a capture at most: each sends as many bytes as the sums have."""
 
-MAX_STORE = 1 << 30
-"""Bytes that the sums may take on the host at most, however much memory there is."""
-
-
 MOST_REDUCED = 4.0
 """Largest factor by which views are reduced."""
 
@@ -173,7 +169,7 @@ def _is_seen(workers: Workers, folder: Path | None) -> bool:
 
 
 def sums_bound(device: torch.device, memory: int) -> int:
-    """Bytes that the sums may take: half of the free memory of their GPU; on a CPU a quarter of the host memory.
+    """Bytes that the sums may take: half of the free memory of their GPU; on a CPU `kept_bytes` of the host memory.
 
     Sums of workers travel through the host, so that its bound holds for them too.
 
@@ -183,7 +179,7 @@ def sums_bound(device: torch.device, memory: int) -> int:
     """
     if device.type == "cuda":
         return max(1, torch.cuda.mem_get_info(device)[0] // 2)
-    return max(1, min(MAX_STORE, memory // 4))
+    return max(1, budget.kept_bytes(memory))
 
 
 _Shard = tuple[tuple[str, ...], range, int, Mapping[str, FeatureMap] | None]

@@ -17,7 +17,7 @@ from lexsplat.language.methods.method import FitRun, TrainingViews, Variant
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.language.methods.trainer import FieldTrainer
 from lexsplat.rendering import PreparedView, prepare
-from lexsplat.runtime.memory import DEFAULT_MEMORY
+from lexsplat.runtime.memory import DEFAULT_MEMORY, kept_bytes
 from lexsplat.runtime.progress import Event, Listener, silent, tell
 from lexsplat.runtime.sampling import evenly
 from lexsplat.runtime.training import run_training, time_steps
@@ -32,9 +32,6 @@ _TOLD_FROM = 200
 """Fewest iterations with a forecast."""
 _FIRST, _STEPS = 2, 6
 """Steps of the calibration that are not timed, and that are."""
-
-MAX_STORE = 1 << 30
-"""Bytes that kept projections may take at most, however much memory there is."""
 
 
 class Trained:
@@ -96,8 +93,7 @@ def train_field(
         config: Settings.
         seed: Seed of the initial field, the order of views and the samples.
         listener: Receives events of stage "language" with the losses.
-        memory: Host memory in bytes, a quarter of which projections kept between steps may take (at most
-            `MAX_STORE`). The result does not depend on it.
+        memory: Host memory in bytes, `kept_bytes` of it for projections; the result does not depend on it.
         checkpoint: Checkpoint to save to and resume from; None saves nothing.
 
     Raises:
@@ -175,7 +171,7 @@ def _prepare_views(
     gaussians: Gaussians, cameras: Mapping[str, Camera], config: TrainedConfig, memory: int
 ) -> dict[str, tuple[Camera, PreparedView | None]]:
     """Cameras at the size to render, each with its projection as long as memory lasts (geometry is fixed)."""
-    left = min(MAX_STORE, memory // 4)
+    left = kept_bytes(memory)
     views: dict[str, tuple[Camera, PreparedView | None]] = {}
     for name, camera in cameras.items():
         resized = camera.downscaled(config.render_downscale)

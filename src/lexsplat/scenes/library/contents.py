@@ -26,7 +26,7 @@ from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.rotations import matrices_from_quaternions
-from lexsplat.language.segment_codes import segment_codes
+from lexsplat.language.segment_codes import codes_of_field
 from lexsplat.language.segments import Segments
 from lexsplat.queries.relevancy import QueryConfig
 from lexsplat.rendering import render
@@ -225,7 +225,7 @@ def _kept_levels(segments: Segments) -> Segments:
 
 def _language(scene: Scene, segments: Segments) -> dict[str, Tensor]:
     """The language of segments and objects, and the scale of the scene."""
-    codes = segment_codes(segments, lambda index: scene.field.select(index).code_probabilities().cpu())
+    codes = codes_of_field(scene.field, segments)
     lowest = codes.distributions[torch.from_numpy(codes.numbers[0])].half()
     rows, columns = lowest.nonzero(as_tuple=True)
     masses = torch.from_numpy(codes.masses[codes.numbers[0]])
@@ -318,8 +318,7 @@ def _images(scene: Scene, means: Tensor) -> dict[str, Any]:
     names, files, cameras = evenly(list(scene.views), _IMAGES), [], []
     seen = np.zeros(len(means), np.uint8)
     for number, name in enumerate(names):
-        camera = scene.camera(name)
-        camera = camera.downscaled(max(1.0, max(camera.width, camera.height) / _SIDE))
+        camera = scene.camera(name).within(_SIDE)
         drawn = render(scene.gaussians, camera, depth=True)
         pixels = (drawn.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
         file = io.BytesIO()

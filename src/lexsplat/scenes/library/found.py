@@ -103,8 +103,7 @@ class Hit:
         scene = self.opened
         things = scene.find(self.answer["phrase"]).instances
         name = things[0].best_view if things else next(iter(scene.views))
-        camera = scene.camera(name)
-        camera = camera.downscaled(max(1.0, max(camera.width, camera.height) / side))
+        camera = scene.camera(name).within(side)
         carried = things[0].mask[:, None].float() if things else None
         with torch.no_grad():
             shown = render(scene.gaussians, camera, features=carried)

@@ -93,8 +93,8 @@ class _KeptPresence(PresenceClassifier):
     @functools.cached_property
     def segment_codes(self) -> SegmentCodes | None:
         """The language of the segments of all levels; made where a phrase names a part of a thing."""
-        spread = torch.from_numpy(_spread(self._contents).toarray())
-        return segment_codes(_segments(self._contents), lambda index: spread[index])
+        masses = self._contents.masses.double().numpy()
+        return segment_codes(_segments(self._contents), masses[:, None] * _spread(self._contents).toarray())
 
 
 @functools.cache
