@@ -28,9 +28,9 @@ def test_another_name_makes_a_part_doubtful_from_a_factor_on():
 @pytest.mark.parametrize(
     ("part", "other"), [("stem", "stalk"), ("wheel", "tire"), ("cap", "cork"), ("head", "face")]
 )
-def test_two_names_of_one_part_are_no_rivals(part, other):
-    assert not is_doubtful(part, AT_FIRST, fits(**{part: 0.1, other: 1.0}))
-    assert is_doubtful(part, AT_FIRST, fits(**{part: 0.1, other: 1.0, "handle": 0.2}))
+def test_of_two_names_of_one_part_the_better_one_counts(part, other):
+    assert not is_doubtful(part, AT_FIRST, fits(**{part: 0.1, other: 1.0, "handle": 1.1}))
+    assert is_doubtful(part, AT_FIRST, fits(**{part: 0.1, other: 1.0, "handle": 1.2}))
 
 
 def test_every_name_that_is_alike_is_compared():

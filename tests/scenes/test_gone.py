@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.gone import gone_nouns, noun_of
@@ -52,6 +53,20 @@ def test_a_recolored_thing_is_found_in_its_color(edited, saved):
     assert "mug" in [each.phrase for each in scene.find("red thing").instances]
 
 
+def test_a_recolored_thing_is_preferred_to_another_one_of_that_color(demo):
+    editor = Editor(demo)
+    editor.recolor(demo.select("apple"), "yellow")
+    for phrase in ("yellow apple", "is the apple yellow?"):  # language finds the duck and the banana
+        assert torch.equal(editor.scene.find(phrase).mask, editor.scene.find("apple").mask)
+
+
+def test_remains_too_faint_to_be_seen_are_nothing_whatever_they_are_called(demo):
+    editor = Editor(demo)
+    editor.delete(demo.select("bottle"))
+    for phrase in ("bottle", "glass", "green glass", "bottle of wine"):
+        assert editor.scene.find(phrase).present == "no", phrase
+
+
 def test_the_built_scene_knows_its_apple_and_undo_brings_it_back(demo):
     editor = Editor(demo)
     editor.delete(demo.select("apple"))
@@ -93,8 +108,11 @@ def test_damaged_records_of_what_is_gone_are_left_out(edited, tmp_path):
         ("red apples", "apple"),
         ("apple stem", "apple"),
         ("toy car", "car"),
-        ("stack of books", "book"),
+        ("stack of books", "stack"),
         ("Mug", "mug"),
+        ("bottle of wine", "bottle"),
+        ("plant leaves", "plant"),
+        ("something made of glass", "made"),
     ],
 )
 def test_the_noun_of_a_phrase_is_its_thing_in_the_singular(phrase, noun):

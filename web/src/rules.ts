@@ -56,9 +56,14 @@ export function besideThing(part: Heights, thing: Heights, best: Float32Array, r
   });
 }
 
+/** A word in the singular, as far as names of parts need it. */
+function bareWord(word: string): string {
+  return { leaves: "leaf", feet: "foot" }[word] ?? word.replace(/s$/, "");
+}
+
 /** Whether a phrase names a part of a thing: the everyday name of the thing, and then another word. */
 export function isPart(phrase: string, rule: EverydayRule): boolean {
-  const words = phrase.toLowerCase().split(/\s+/).map((word) => word.replace(/s$/, ""));
+  const words = phrase.toLowerCase().split(/\s+/).map(bareWord);
   const last = words.pop()!;
   const named = rule.parts.includes(last) || (!rule.names.includes(last) && !rule.qualities.includes(last));
   return named && words.some((word) => rule.names.includes(word));
@@ -67,22 +72,22 @@ export function isPart(phrase: string, rule: EverydayRule): boolean {
 /** The thing of which a phrase names a part; empty if it names none of the rule's parts. */
 export function thingOfPart(phrase: string, rule: EverydayRule): string {
   const words = phrase.toLowerCase().split(/\s+/);
-  const bare = words.map((word) => word.replace(/s$/, ""));
+  const bare = words.map(bareWord);
   if (!isPart(phrase, rule) || !rule.parts.includes(bare.at(-1)!)) return "";
   return words.slice(0, bare.slice(0, -1).findLastIndex((word) => rule.names.includes(word)) + 1).join(" ");
 }
 
 /** Whether a phrase is one of the rule's parts without its thing, such as "handle". */
 export function isPartAlone(phrase: string, rule: EverydayRule): boolean {
-  return rule.parts.includes(phrase.toLowerCase().replace(/s$/, ""));
+  return rule.parts.includes(bareWord(phrase.toLowerCase()));
 }
 
 /** Whether another part fits a place, a distribution [K], better than the one that a phrase names; `fits` is [W, K]. */
 export function isDoubtful(phrase: string, place: Float32Array, fits: Float32Array, rule: EverydayRule): boolean {
-  const part = phrase.toLowerCase().split(/\s+/).at(-1)!.replace(/s$/, "");
+  const part = bareWord(phrase.toLowerCase().split(/\s+/).at(-1)!);
   const alike = rule.alike.find((group) => group.includes(part)) ?? [part];
   const at = (name: number): number => Math.max(0, dot(place, fits.subarray(name * place.length, (name + 1) * place.length)));
-  const own = at(rule.parts.indexOf(part));
+  const own = Math.max(...alike.map((name) => at(rule.parts.indexOf(name))));
   return rule.parts.some((name, n) => !alike.includes(name) && at(n) > rule.rival * own);
 }
 

@@ -151,7 +151,7 @@ export class Tables implements Source {
     const described = tower.describe(phrase);
     const own = this.language.scores(described.table);
     const thing = thingOfPart(phrase, described.rule);
-    const noun = (thing || phrase).toLowerCase().split(/\s+/).at(-1)!;
+    const noun = (thing || phrase).toLowerCase().split(" of ")[0].split(/\s+/).at(-1)!;
     const isGone = described.rule.gone.includes(this.spelling?.singular(noun) ?? noun);
     const presence = isGone ? "no" : this.#presence(phrase, own, described, thing ? tower.describe(thing) : null);
     const found = await this.#whole(phrase, own, presence);
@@ -192,8 +192,10 @@ export class Tables implements Source {
     const { words, held } = this.cuts;
     const parts = isPartAlone(phrase, words) ? await this.#ofObjects(phrase, whole, this.segments, held) : null;
     const scores = parts?.scores ?? (await this.#cut(phrase, own, whole, this.segments, this.cuts)) ?? whole;
-    const seen = this.#hasColor(phrase, this.#seen(scores, threshold, this.segments), held);
-    const sure = seen && parts?.presence !== "unsure";
+    const splats = this.#seen(scores, threshold, this.segments);
+    const opacity = splats.reduce((sum, i) => sum + this.geometry.opacities[i], 0);
+    if (splats.length && opacity < this.geometry.rule.evidence_faint * splats.length) return { scores: own, own, presence: "no" as const, threshold };
+    const sure = this.#hasColor(phrase, splats, held) && parts?.presence !== "unsure";
     return { scores, own, ...parts, presence: presence === "yes" && !sure ? ("unsure" as const) : presence, threshold };
   }
 

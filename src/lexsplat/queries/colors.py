@@ -68,6 +68,12 @@ def color_told(phrase: str) -> set[str]:
     return set(before) & set(COLOR_WORDS)
 
 
+def without_color(phrase: str) -> str:
+    """A phrase without the colors that it tells: "mug" of "red mug"."""
+    told = color_told(phrase)
+    return " ".join(word for word in phrase.split() if word.lower().replace("grey", "gray") not in told)
+
+
 def may_be(told: set[str], seen: set[str]) -> bool:
     """Whether a thing seen in some colors may have one of the colors that a phrase tells, in another light."""
     pairs = [set(pair.split()) for pair in NEAR]

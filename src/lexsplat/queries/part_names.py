@@ -21,7 +21,7 @@ RIVAL = 1.15
 """Factor by which another name describes a place better than that of the part, from which the part is doubtful."""
 _ALIKE = "stem stalk, wheel tire, lid cap cork, foot paw leg, leaf petal, cord string, head face"
 ALIKE = tuple(group.split() for group in words(_ALIKE))
-"""Names that people give to one part, which are no rivals."""
+"""Names that people give to one part, of which the best counts."""
 DOUBTFUL = "names of other parts fit this place better"
 """The note on a part that is taken for another one."""
 _LEAST = 1e-6
@@ -45,5 +45,5 @@ def is_doubtful(part: str, place: Tensor, fits: Tensor) -> bool:
     """
     fit = (place.to(fits) @ fits).clamp_min(0).cpu()
     same = next((group for group in ALIKE if part in group), [part])
-    rivals = torch.tensor([name not in same for name in NAMES])
-    return bool((fit[rivals] > RIVAL * fit[NAMES.index(part)]).any())
+    asked = torch.tensor([name in same for name in NAMES])
+    return bool(fit[~asked].max() > RIVAL * fit[asked].max())

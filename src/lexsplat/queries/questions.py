@@ -49,6 +49,7 @@ _CONTRACTIONS = (
     (r"\b(i|we|you)'ve\b", r"\1 have"),
     (r"\b(i|we|you)'d\b", r"\1 would"),
     (r"\b(what|where)s\b", r"\1 is"),
+    (r"\bgrey\b", "gray"),
     (rf"\b({'|'.join(sorted(NAMES))})'s (?=\w)", r"\1 "),
 )
 _TAIL = re.compile(

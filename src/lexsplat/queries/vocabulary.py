@@ -69,28 +69,37 @@ QUALITIES = frozenset(words(_QUALITIES)) | COLORS | STATES
 
 def has_color(phrase: str) -> bool:
     """Whether a phrase names a color."""
-    return not COLORS.isdisjoint(phrase.lower().split())
+    return not COLORS.isdisjoint(phrase.lower().replace("grey", "gray").split())
 
 
 def is_part(phrase: str) -> bool:
     """Whether a phrase names a part of a thing: the everyday name of the thing, and then another word."""
-    *before, last = (word.removesuffix("s") for word in phrase.lower().split() or [""])
+    *before, last = (_bare(word) for word in phrase.lower().split() or [""])
     return (last in PARTS or last not in NAMES | QUALITIES) and not NAMES.isdisjoint(before)
 
 
 def thing_of_part(phrase: str) -> str:
     """The thing of which a phrase names a part: "red mug" of "red mug handle"; empty if it names none of `PARTS`."""
     *before, last = phrase.lower().split() or [""]
-    if not is_part(phrase) or last.removesuffix("s") not in PARTS:
+    if not is_part(phrase) or _bare(last) not in PARTS:
         return ""
-    end = max(place for place, word in enumerate(before) if word.removesuffix("s") in NAMES)
+    end = max(place for place, word in enumerate(before) if _bare(word) in NAMES)
     return " ".join(before[: end + 1])
 
 
 def is_part_alone(phrase: str) -> bool:
     """Whether a phrase is one of `PARTS` without its thing, such as "handle" or "wheels"."""
     article, _, noun = phrase.lower().rpartition(" ")
-    return article in ("", "a", "an", "the") and noun.removesuffix("s") in PARTS
+    return article in ("", "a", "an", "the") and _bare(noun) in PARTS
+
+
+def part_named(phrase: str) -> str:
+    """The last word of a phrase in the singular, as `PARTS` has it: "leaf" of "plant leaves"."""
+    return _bare(phrase.lower().split()[-1])
+
+
+def _bare(word: str) -> str:
+    return {"leaves": "leaf", "feet": "foot"}.get(word, word.removesuffix("s"))
 
 
 def default_vocabulary(clip: str = "") -> list[str]:

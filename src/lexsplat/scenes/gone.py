@@ -37,11 +37,14 @@ def gone_nouns(scene: Scene) -> frozenset[str]:
 
 def noun_of(phrase: str) -> str:
     """The noun of the thing that a phrase names, or names a part of: "apple" of "red apples" and of "apple stem"."""
-    return singular((thing_of_part(phrase) or phrase).lower().split()[-1])
+    return singular((thing_of_part(phrase) or phrase).lower().split(" of ")[0].split()[-1])
 
 
 def _nouns(objects: Sequence[Selection]) -> frozenset[str]:
-    return frozenset(noun_of(each.phrase) for each in objects)
+    """The nouns of names; of "stack of books" both."""
+    return frozenset(
+        noun for each in objects for noun in (noun_of(each.phrase), noun_of(each.phrase.split()[-1]))
+    )
 
 
 def _is_text(value: object) -> bool:

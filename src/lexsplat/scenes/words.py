@@ -19,10 +19,11 @@ from lexsplat.queries.colors import SEEN, color_shares, color_told, color_words,
 from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.part_names import DOUBTFUL, is_doubtful
 from lexsplat.queries.parts import FEWEST, HELD, part_scores, with_parts
+from lexsplat.queries.presence import FAINT
 from lexsplat.queries.scoring import form_used
 from lexsplat.queries.selection import Presence, Selection
 from lexsplat.queries.thresholds import BORDER
-from lexsplat.queries.vocabulary import STUFF, SURFACES, is_part_alone, thing_of_part
+from lexsplat.queries.vocabulary import STUFF, SURFACES, is_part_alone, part_named, thing_of_part
 from lexsplat.scenes.formats.tables import colors_of
 from lexsplat.scenes.gone import gone_nouns, noun_of
 
@@ -57,7 +58,16 @@ def with_objects(scene: Scene, prompt: str, word: Word) -> Word:
     """The answer to a prompt, given its relevancy and its presence by language."""
     if word.presence != "no" and (noun := noun_of(prompt)) in gone_nouns(scene):
         return replace(word, scores=word.own, presence="no", note=f"an edit took the {noun} away")
-    return of_color(scene, prompt, of_part(scene, prompt, of_kind(scene, prompt, word)))
+    return _if_visible(scene, of_color(scene, prompt, of_part(scene, prompt, of_kind(scene, prompt, word))))
+
+
+def _if_visible(scene: Scene, word: Word) -> Word:
+    """The word, or "no" where what is selected is too faint to be seen, such as what remains of a deleted thing."""
+    taken = (word.scores >= BORDER) & ~scene.hidden
+    if word.presence == "no" or scene.field.segments is None or not bool(taken.any()):
+        return word
+    faint = float(scene.gaussians.opacities[taken].mean()) < FAINT
+    return replace(word, presence="no") if faint else word
 
 
 def of_kind(scene: Scene, prompt: str, word: Word) -> Word:
@@ -100,8 +110,7 @@ def _is_doubtful(scene: Scene, prompt: str, word: Word) -> bool:
         return False
     probabilities, shown = scene.field.select(taken).code_probabilities(), segments.masses[taken]
     place = shown.to(probabilities) @ probabilities / shown.sum().clamp_min(1e-12)
-    part = prompt.lower().split()[-1].removesuffix("s")
-    return is_doubtful(part, place, scene.presence_classifier.part_fits)
+    return is_doubtful(part_named(prompt), place, scene.presence_classifier.part_fits)
 
 
 def of_color(scene: Scene, prompt: str, word: Word) -> Word:
@@ -114,14 +123,14 @@ def of_color(scene: Scene, prompt: str, word: Word) -> Word:
     told = color_told(prompt)
     if not told or form_used(scene.field, scene.query) != "segment" or not scene.field.segments:
         return word
-    if word.presence != "yes":
-        return _of_members(word, of_color_told(scene, prompt, told))
-    taken = (word.scores >= BORDER) & ~scene.hidden
-    held, name = holding(scene, taken), prompt.lower().split()[-1]
-    if held and name in _last_words(scene.objects) - _last_words(held):
-        return replace(word, presence="unsure")
-    seen = {color for each in held for color in seen_colors(scene, each)}
-    return replace(word, presence="unsure") if seen and not may_be(told, seen) else word
+    if word.presence == "yes":
+        held, name = holding(scene, (word.scores >= BORDER) & ~scene.hidden), prompt.lower().split()[-1]
+        other = held and name in _last_words(scene.objects) - _last_words(held)
+        seen = {color for each in held for color in seen_colors(scene, each)}
+        if not other and (not seen or may_be(told, seen)):
+            return word
+        word = replace(word, presence="unsure")
+    return _of_members(word, of_color_told(scene, prompt, told))
 
 
 def of_color_told(scene: Scene, prompt: str, told: set[str]) -> list[Selection]:

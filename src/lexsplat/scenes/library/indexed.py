@@ -33,7 +33,7 @@ from lexsplat.queries.everyday import EverydayScale
 from lexsplat.queries.grammar import understand
 from lexsplat.queries.kinds import is_kind, is_of_kind, words_of_things
 from lexsplat.queries.phrases import Thing
-from lexsplat.queries.presence import DescribedPlaces, PresenceClassifier
+from lexsplat.queries.presence import FAINT, DescribedPlaces, PresenceClassifier
 from lexsplat.queries.segments import SEGMENT_THRESHOLD, segment_relevancy
 from lexsplat.queries.selection import PEAK_COUNT, SMALLEST_SHARE, Presence, Selection
 from lexsplat.queries.spelling import corrected, strange
@@ -177,9 +177,23 @@ def answer_from(contents: Contents, codes: Tensor, thing: Thing, phrase: str, te
     large = counts[taken].sum() >= _LARGE * counts.sum() and NAMES.isdisjoint(words)
     if not len(taken) or (large and words[-1] not in STUFF):
         return None
+    if contents.opacities.numpy()[taken].sum() < FAINT * counts[taken].sum():
+        return Indexed({**_answer([], "no"), **common}, contents)
     parts = [taken] if words[-1] in STUFF else _instances(contents, taken, own[0].numpy())
     found = [_instance(contents, part, scores, thing.text) for part in parts]
+    if not found or (told and not any(_is_in_color(contents, each[0], words[-1], told) for each in found)):
+        return None
     return Indexed({**_answer([each[0] for each in found], presence), **common}, contents, *found[0][1:])
+
+
+def _is_in_color(contents: Contents, instance: Mapping[str, Any], name: str, told: set[str]) -> bool:
+    """Whether an instance lies in an object of a name that is seen in a color, or in a near one."""
+    for each, colors in zip(contents.facts["objects"], contents.facts.get("colors", ())):
+        place = np.array(each["axes"]) @ (np.array(instance["center"]) - each["center"])
+        inside = bool((np.abs(place) <= np.array(each["size"]) / 2).all())
+        if inside and each["name"].split()[-1] == name and may_be(told, set(colors)):
+            return True
+    return False
 
 
 def _colors_of(contents: Contents, name: str) -> list[set[str]]:

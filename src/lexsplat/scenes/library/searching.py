@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from torch import Tensor
 
+from lexsplat.queries.colors import without_color
 from lexsplat.queries.grammar import thing_of, understand
 from lexsplat.queries.kinds import is_of_kind, unknown_note, words_of_things
 from lexsplat.queries.phrases import Phrase, Thing, Understood, things_of, with_things
@@ -304,10 +305,13 @@ def _bounds(library: Library, records: list[Record], phrase: Phrase) -> list[flo
 
 
 def spellings_of(phrase: Phrase, clip: str) -> dict[str, tuple[str, ...]]:
-    """The texts of the things of a phrase, each with its possible corrections and the members of its kind."""
+    """The texts of the things of a phrase, each with its possible corrections and the members of its kind.
+
+    A thing may have a color that language does not find, so it is also compared without its color.
+    """
     found = {}
     for text in things_of(phrase):
-        meant = (text, *spellings(text, words_of_things(clip)))
+        meant = (text, without_color(text), *spellings(text, words_of_things(clip)))
         members = (name for name in default_vocabulary(clip) if any(is_of_kind(name, one) for one in meant))
         found[text] = tuple(dict.fromkeys((*meant, *members)))
     return found
