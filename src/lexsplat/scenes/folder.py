@@ -313,9 +313,13 @@ class SceneFolder:
         """
         path = self.gaussians_path
         known = self.record.get("checksums", {}).get(path.name)
-        if known is None or "reconstruct" not in self.record["stages"] or not path.is_file():
+        if known is None or "reconstruct" not in self.record["stages"]:
             return False
-        if file_checksum(path) != known:
+        try:
+            found = file_checksum(path)
+        except FileNotFoundError:  # a build may have moved it in the meantime; reading it tells
+            return False
+        if found != known:
             raise FileFormatError(
                 path,
                 expected="the Gaussians that were written",

@@ -63,10 +63,10 @@ def with_objects(scene: Scene, prompt: str, word: Word) -> Word:
 
 def _if_visible(scene: Scene, word: Word) -> Word:
     """The word, or "no" where what is selected is too faint to be seen, such as what remains of a deleted thing."""
-    taken = (word.scores >= BORDER) & ~scene.hidden
-    if word.presence == "no" or scene.field.segments is None or not bool(taken.any()):
+    if word.presence == "no" or form_used(scene.field, scene.query) != "segment":
         return word
-    faint = float(scene.gaussians.opacities[taken].mean()) < FAINT
+    taken = (word.scores >= BORDER) & ~scene.hidden
+    faint = bool(taken.any()) and float(scene.gaussians.opacities[taken].mean()) < FAINT
     return replace(word, presence="no") if faint else word
 
 
