@@ -97,6 +97,7 @@ def test_what_the_light_tower_does_not_know_is_left_to_transformers(clip_folder,
     assert refused(vocab_size=999)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("load", [load_text, load_clip])
 def test_a_character_of_several_bytes_may_be_several_tokens(load):
     # None of them is a word of the bundled model: 20 times 3 bytes, start and end, of which 24 tokens are read.

@@ -197,6 +197,7 @@ def replaced(array: np.ndarray, ending: str = "_s.npy"):
     return lambda path: np.save(path.with_name(f"view_03{ending}"), array)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "told"),
     [

@@ -291,6 +291,7 @@ def few_views(capture: Capture, names: list[str]) -> Capture:
     )
 
 
+@pytest.mark.slow
 def test_segments_share_the_stored_crops_and_are_found_once(
     tiny_capture, exact, two_levels, tmp_path, monkeypatch
 ):
@@ -324,6 +325,7 @@ def test_segments_share_the_stored_crops_and_are_found_once(
 # -- what they are good for
 
 
+@pytest.mark.slow
 def test_exact_masks_of_the_second_capture_sharpen_features_at_outlines(tmp_path):
     """Masks of a held-out photo as its segments: near outlines, more cells are nearest to the right words."""
     whole = load_capture(demo_capture("second"))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import pytest
+
 from lexsplat import cli, open_scene
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.facts import scene_facts
 from lexsplat.scenes.folder import SceneFolder
 
 
+@pytest.mark.slow
 def test_facts_of_an_edited_scene_are_those_of_its_files(tmp_path, capsys):
     opened = open_scene("demo", device="cpu")
     editor = Editor(opened)

@@ -226,6 +226,7 @@ def test_a_damaged_file_or_one_of_another_scene_counts_as_none(demo_copy):
     assert not scene.seen.complete
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_noted_where_a_missing_encoder_is_not(demo_copy, monkeypatch, caplog):
     def failing(error):
         def write(*_):
