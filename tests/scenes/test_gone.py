@@ -111,6 +111,7 @@ def test_damaged_records_of_what_is_gone_are_left_out(edited, tmp_path):
         ("stack of books", "stack"),
         ("Mug", "mug"),
         ("bottle of wine", "bottle"),
+        (" of mug", "mug"),
         ("plant leaves", "plant"),
         ("something made of glass", "made"),
     ],

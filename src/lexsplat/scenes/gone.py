@@ -37,7 +37,7 @@ def gone_nouns(scene: Scene) -> frozenset[str]:
 
 def noun_of(phrase: str) -> str:
     """The noun of the thing that a phrase names, or names a part of: "apple" of "red apples" and of "apple stem"."""
-    return singular((thing_of_part(phrase) or phrase).lower().split(" of ")[0].split()[-1])
+    return singular((thing_of_part(phrase) or phrase).lower().strip().split(" of ")[0].split()[-1])
 
 
 def _nouns(objects: Sequence[Selection]) -> frozenset[str]:
