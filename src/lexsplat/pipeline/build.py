@@ -108,11 +108,7 @@ def build(
     config = replace(config, encoder_device=choose_encoder_device(config.encoder_device, device))  # type: ignore[arg-type]
     if device == "cuda":
         require_gsplat()  # before anything that takes time
-    if source is not None:
-        refuse_output_in_capture(source, Path(output))
-    folder = SceneFolder(Path(output))
-    folder.refuse_foreign_files()
-    folder.refuse_edited()
+    folder = _output_folder(source, Path(output))
     is_new = not folder.root.exists()
     above = [place for place in folder.root.absolute().parents if not place.exists()]
     given = (source,) if source is not None and source.is_dir() else ()  # of a video workers get the frames
@@ -149,6 +145,16 @@ def build(
             if is_new:  # the lock is held, so nobody else uses the folder
                 folder.withdraw(above)
             raise
+
+
+def _output_folder(source: Path | None, output: Path) -> SceneFolder:
+    """The folder of a build; one of a capture, of other files or of a saved edit is refused."""
+    if source is not None:
+        refuse_output_in_capture(source, output)
+    folder = SceneFolder(output)
+    folder.refuse_foreign_files()
+    folder.refuse_edited()
+    return folder
 
 
 def _check_request(source: Path | None, splats: Path | None, until: str, config: BuildConfig) -> None:
@@ -273,7 +279,7 @@ class _Builder:
         return self._whole[name]
 
     def _is_whole(self, name: str, stage: _Stage) -> bool:
-        """Whether the files of a stage are undamaged; a warning names the first one that is not."""
+        """Whether the files of a stage are whole. A warning names the first damaged one."""
         try:
             for path in stage.outputs:
                 self.folder.check_file(path)
