@@ -67,6 +67,13 @@ def test_remains_too_faint_to_be_seen_are_nothing_whatever_they_are_called(demo)
         assert editor.scene.find(phrase).present == "no", phrase
 
 
+def test_the_mask_of_a_recolored_thing_is_that_of_the_thing(edited):
+    scene = edited[0]
+    red, mug = (scene.relevancy(phrase, "view_057")[0] >= 0.5 for phrase in ("red mug", "mug"))
+    assert int(mug.sum()) > 500
+    assert int((red & mug).sum()) > 0.9 * int((red | mug).sum())
+
+
 def test_the_built_scene_knows_its_apple_and_undo_brings_it_back(demo):
     editor = Editor(demo)
     editor.delete(demo.select("apple"))

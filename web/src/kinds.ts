@@ -45,16 +45,16 @@ export class Kinds {
     this.#places ??= this.#found();
     const isOne = ({ name, colors: own }: ObjectEntry): boolean => name.split(" ").at(-1) === noun && colors.includes(own?.[0] ?? "");
     const all = [...this.#objects.keys()].filter((place) => isOne(this.#objects[place]) && this.#places![place].splats.length);
-    const found = this.#answer(all, plain);
+    const found = this.#answer(all, plain, 0.9); // words.TOLD
     return found && { ...found, note: "" };
   }
 
-  #answer(members: number[], plain: Float32Array | null): ReturnType<Kinds["find"]> {
+  #answer(members: number[], plain: Float32Array | null, least = this.geometry.rule.threshold): ReturnType<Kinds["find"]> {
     if (members.length === 0) return null;
     const { threshold } = this.geometry.rule;
     const scores = plain?.map((score) => Math.min(score, threshold - 1e-4)) ?? new Float32Array(this.geometry.count);
     const places = members.map((place) => this.#places![place]);
-    for (const { splats } of places) for (const splat of splats) scores[splat] = plain ? Math.max(plain[splat], threshold) : 1;
+    for (const { splats } of places) for (const splat of splats) scores[splat] = plain ? Math.max(plain[splat], least) : 1;
     const names = [...new Set(members.map((place) => this.#objects[place].name))];
     return { scores, presence: "yes", members: places, places, note: names.join(", ") };
   }
