@@ -215,3 +215,11 @@ def test_a_missing_language_file_is_reported_by_its_name(tmp_path):
     with pytest.raises(SceneFolderError, match=r"found no language\.safetensors") as told:
         open_scene(folder)
     assert "finished stages" not in str(told.value)
+
+
+@pytest.mark.parametrize("kind", ["toy", "animal", "fruit"])
+def test_the_mask_of_a_kind_holds_each_of_its_members(demo, kind):
+    mask = demo.relevancy(kind, "view_036")[0] >= 0.5
+    for each in demo.find(kind).instances:
+        own = demo.relevancy(each.phrase, "view_036")[0] >= 0.5
+        assert int((mask & own).sum()) > 0.8 * int(own.sum()), each.phrase

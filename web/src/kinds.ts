@@ -4,6 +4,9 @@ import type { Found } from "./answers";
 import type { Geometry, Place } from "./geometry";
 import { type ObjectEntry, PageError } from "./manifest";
 
+/** Score of an object that is the answer, where language has less, as in lexsplat.scenes.words. */
+const MEMBER = 0.9;
+
 export class Kinds {
   readonly #members: ReadonlyMap<string, number[]>;
   readonly #objects: ObjectEntry[];
@@ -45,16 +48,16 @@ export class Kinds {
     this.#places ??= this.#found();
     const isOne = ({ name, colors: own }: ObjectEntry): boolean => name.split(" ").at(-1) === noun && colors.includes(own?.[0] ?? "");
     const all = [...this.#objects.keys()].filter((place) => isOne(this.#objects[place]) && this.#places![place].splats.length);
-    const found = this.#answer(all, plain, 0.9); // words.TOLD
+    const found = this.#answer(all, plain);
     return found && { ...found, note: "" };
   }
 
-  #answer(members: number[], plain: Float32Array | null, least = this.geometry.rule.threshold): ReturnType<Kinds["find"]> {
+  #answer(members: number[], plain: Float32Array | null): ReturnType<Kinds["find"]> {
     if (members.length === 0) return null;
     const { threshold } = this.geometry.rule;
     const scores = plain?.map((score) => Math.min(score, threshold - 1e-4)) ?? new Float32Array(this.geometry.count);
     const places = members.map((place) => this.#places![place]);
-    for (const { splats } of places) for (const splat of splats) scores[splat] = plain ? Math.max(plain[splat], least) : 1;
+    for (const { splats } of places) for (const splat of splats) scores[splat] = plain ? Math.max(plain[splat], MEMBER) : 1;
     const names = [...new Set(members.map((place) => this.#objects[place].name))];
     return { scores, presence: "yes", members: places, places, note: names.join(", ") };
   }

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
 
 
-TOLD = 0.9
-"""Score of an object of the color that is told, where language has less: at the border itself, masks stay empty."""
+MEMBER = 0.9
+"""Score of an object that is the answer, where language has less: at the border itself, masks stay empty."""
 
 
 @dataclass(eq=False)
@@ -134,7 +134,7 @@ def of_color(scene: Scene, prompt: str, word: Word) -> Word:
         if not other and (not seen or may_be(told, seen)):
             return word
         word = replace(word, presence="unsure")
-    return _of_members(word, of_color_told(scene, prompt, told), TOLD)
+    return _of_members(word, of_color_told(scene, prompt, told))
 
 
 def of_color_told(scene: Scene, prompt: str, told: set[str]) -> list[Selection]:
@@ -144,13 +144,13 @@ def of_color_told(scene: Scene, prompt: str, told: set[str]) -> list[Selection]:
     return [each for each in named if object_colors(scene, each)[0] in told]
 
 
-def _of_members(word: Word, members: Sequence[Selection], least: float = BORDER) -> Word:
-    """A word that is answered by objects, with scores of at least ``least``; as it is if there are none."""
+def _of_members(word: Word, members: Sequence[Selection]) -> Word:
+    """A word that is answered by objects; as it is if there are none."""
     if not members:
         return word
     taken = torch.stack([each.mask for each in members]).any(0)
-    # Members reach the border, and all others stay below it.
-    inside, outside = word.scores.clamp(min=least), word.scores.clamp(max=BORDER - 1e-4)
+    # Members exceed the border, and all others stay below it.
+    inside, outside = word.scores.clamp(min=MEMBER), word.scores.clamp(max=BORDER - 1e-4)
     return replace(word, scores=torch.where(taken, inside, outside), presence="yes", members=tuple(members))
 
 
