@@ -19,7 +19,7 @@ from lexsplat.language.methods.joint import JointTrainer
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.splats import check_agreement, existing_splats, splats_hash, with_filter_of_photos
 from lexsplat.pipeline.viewpoints import splats_of_capture
-from lexsplat.reconstruction import Reconstructor, check_gaussians, reconstruct, tell_time
+from lexsplat.reconstruction import Reconstructor, check_gaussians, compile_kernels, reconstruct, tell_time
 from lexsplat.reconstruction.block_training import BlockRun, reconstruct_blocks
 from lexsplat.reconstruction.blocks import number_of_blocks
 from lexsplat.runtime.progress import uncounted
@@ -131,6 +131,7 @@ class _WithLanguage(Geometry):
         def joined(reconstructor: Reconstructor) -> JointTrainer:
             return self.method.joined(reconstructor, views, config, config.seed)
 
+        compile_kernels(run.device)
         tell_time(*start, **options, listener=run.fit.listener, joined=joined)
         training = joined(Reconstructor(*start, **options, seed=config.seed))
         return self.method.fit_geometry(training, run.fit), {"joint": True}

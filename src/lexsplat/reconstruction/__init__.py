@@ -9,6 +9,7 @@ import torch
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.reconstruction.few_photos import has_few_photos, points_between, warn_of_few_photos
+from lexsplat.reconstruction.first_run import compile_kernels
 from lexsplat.reconstruction.forecasting import tell_time
 from lexsplat.reconstruction.settings import LONG_TRAINING, ReconstructionConfig
 from lexsplat.reconstruction.trainer import EVENT_EVERY, STAGE, Reconstructor
@@ -26,6 +27,7 @@ __all__ = [
     "ReconstructionConfig",
     "Reconstructor",
     "check_gaussians",
+    "compile_kernels",
     "reconstruct",
     "tell_time",
 ]
@@ -68,6 +70,7 @@ def reconstruct(
     few = has_few_photos(capture)
     if few and points.origin != "random":
         points = points_between(capture, points, seed)
+    compile_kernels(device)
     tell_time(capture, config, points, device=device, memory=memory, listener=listener)
     trainer = Reconstructor(capture, config, points, device=device, seed=seed, memory=memory)
     trainer.run(listener, checkpoint)

@@ -11,6 +11,7 @@ import functools
 import itertools
 import logging
 import os
+import sys
 import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import event
+from numba.core import event, registry
 
 from lexsplat.runtime.device import kernel_threads
 from lexsplat.runtime.environment import user_cache
@@ -78,14 +79,26 @@ def _cache_folder() -> str:
     return tempfile.mkdtemp(prefix="lexsplat-kernels-")
 
 
+def marker_of(kernels: str) -> Path:
+    """An empty file beside the compiled kernels that says that all ``kernels`` are there, for this processor."""
+    target = registry.cpu_target.target_context.codegen().magic_tuple()
+    return Path(_cache_folder()) / f"{kernels}-{digest([repr((sys.version, target)).encode()], 6)}"
+
+
+def announce() -> None:
+    """Log once per process that kernels are compiled."""
+    global _announced
+    if not _announced:
+        _announced = True
+        logger.log(NOTE, "compiling CPU kernels, once (about 15 seconds)")
+
+
 class _Announcer(event.Listener):
-    """Logs once per process that kernels are compiled; Numba sends no event for kernels from the cache."""
+    """Announces that kernels are compiled; Numba sends no event for kernels from the cache."""
 
     def on_start(self, event: Any) -> None:
-        global _announced
-        if not _announced and event.data["dispatcher"] in _dispatchers:
-            _announced = True
-            logger.log(NOTE, "compiling CPU kernels, once (about 15 seconds)")
+        if event.data["dispatcher"] in _dispatchers:
+            announce()
 
     def on_end(self, event: Any) -> None:
         pass

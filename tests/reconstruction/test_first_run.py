@@ -1,0 +1,78 @@
+"""The kernels of a training are compiled once, in a process of its own, and in the training where that fails."""
+
+import subprocess
+import sys
+
+import pytest
+from support.tiny_capture import write_capture
+from support.warm_starts import Program, Stage, run_warm
+
+from lexsplat.reconstruction import first_run
+from lexsplat.rendering.kernels import jit
+
+TRAINING = """
+import sys
+import torch
+from lexsplat.captures import load_capture
+from lexsplat.captures.sfm.triangulation import initial_points
+from lexsplat.reconstruction import ReconstructionConfig, Reconstructor, first_run
+from lexsplat.rendering.kernels import jit
+
+def used():
+    return {(kernel.__name__, signature) for kernel in jit._dispatchers for signature in kernel.signatures}
+
+first_run._train_a_little()
+before = used()
+capture = load_capture(sys.argv[1])
+trainer = Reconstructor(capture, ReconstructionConfig(iterations=4, warm_up=0.5), initial_points(capture))
+for _ in range(4):
+    trainer.step()
+print(len(before), sorted(used() - before))
+"""
+
+
+@pytest.mark.slow
+def test_a_training_needs_no_kernel_that_was_not_compiled_before_it(tmp_path):
+    capture = write_capture(tmp_path / "capture", views=4, width=64, height=48)
+    (run,) = run_warm(Stage(["torch"], [[Program(TRAINING, [str(capture)])]]))
+    assert run.status == 0, run.err
+    count, missing = run.out.split(maxsplit=1)
+    assert int(count) > 20
+    assert missing.strip() == "[]"
+
+
+class Started(list):
+    """Stands in for `subprocess.run`."""
+
+    def __init__(self, status: int = 0) -> None:
+        super().__init__()
+        self.status = status
+
+    def __call__(self, command: list[str], **options: object) -> subprocess.CompletedProcess:
+        self.append(command)
+        if self.status < 0:
+            raise PermissionError(command[0])
+        return subprocess.CompletedProcess(command, self.status)
+
+
+@pytest.fixture
+def nothing_compiled(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(jit, "_cache_folder", lambda: str(tmp_path))
+
+
+@pytest.mark.parametrize(("status", "times"), [(0, 1), (1, 2), (-1, 2)], ids=["works", "fails", "refused"])
+def test_kernels_are_compiled_by_another_process_until_it_has_worked_once(
+    nothing_compiled, monkeypatch, status, times
+):
+    started = Started(status)
+    monkeypatch.setattr(subprocess, "run", started)
+    for _ in range(2):
+        first_run.compile_kernels("cpu")
+    assert started == [[sys.executable, "-m", "lexsplat.reconstruction.first_run"]] * times
+
+
+def test_a_training_on_a_gpu_compiles_no_kernels_of_the_cpu(nothing_compiled, monkeypatch):
+    started = Started()
+    monkeypatch.setattr(subprocess, "run", started)
+    first_run.compile_kernels("cuda")
+    assert not started
