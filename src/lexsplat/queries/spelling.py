@@ -1,4 +1,4 @@
-"""Words: singulars, and typing errors against a vocabulary. simplemma has the dictionary."""
+"""Words: singulars, and typing errors against a vocabulary."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import re
 from collections.abc import Iterable, Sequence, Set
 from functools import lru_cache
 from itertools import islice, product
+
+from lexsplat.queries import dictionary
 
 _SAME_FORM = {"glass", "cloth", "cutlery", "stairs", "people", "scissors", "trousers", "clothes", "pants"}
 _NOT_BY_LEMMA = {"leaves": "leaf", "shelves": "shelf", "lenses": "lens"}
@@ -43,9 +45,7 @@ def _singular_word(word: str) -> str:
     if lemma is None:
         if not small.endswith("s") and small not in _IRREGULAR:
             return word
-        import simplemma
-
-        lemma = simplemma.lemmatize(small, lang="en")
+        lemma = dictionary.lemma(small)
     if lemma == small:
         return word
     return word[: len(lemma)] if word.lower().startswith(lemma) else lemma
@@ -58,16 +58,12 @@ _IRREGULAR = {"men", "women", "children", "mice", "geese", "teeth", "feet", "oxe
 def is_word(word: str) -> bool:
     """Whether a word is in the English dictionary."""
     small = word.lower()
-    if small in _everyday():
-        return True
-    import simplemma
-
-    return bool(simplemma.is_known(small, lang="en"))
+    return small in _everyday() or dictionary.is_english(small)
 
 
 @lru_cache(1)
 def _everyday() -> Set[str]:
-    """Words of things and colors, which spare reading the dictionary: a tenth of a second. It lacks one of them."""
+    """Words of things and colors, which spare the dictionary. It lacks one of them."""
     from lexsplat.queries.everyday import everyday_words
     from lexsplat.queries.vocabulary import COLORS
 
