@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.forked_commands import Command
 from support.written_captures import save
 
 from lexsplat.captures import poses_from_photos
@@ -63,14 +62,15 @@ def test_the_room_is_that_of_the_features_without_those_of_an_earlier_run(
 @pytest.mark.slow
 def test_a_limit_of_file_sizes_ends_structure_from_motion_in_one_line(photos, tmp_path):
     resource = pytest.importorskip("resource", reason="no limit of file sizes on this system")
-    done = subprocess.run(
-        [sys.executable, "-m", "lexsplat", "poses", str(photos), "--output", str(tmp_path / "model")],
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000)),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 1, done.stderr[-2000:]
-    told = [line for line in done.stderr.splitlines() if "error: " in line]
-    assert len(told) == 1, done.stderr[-2000:]
+    with Command(
+        "poses",
+        str(photos),
+        "--output",
+        str(tmp_path / "model"),
+        prepare=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000)),
+    ) as command:
+        done = command.ended()
+    assert done.status == 1, done.err[-2000:]
+    told = [line for line in done.err.splitlines() if "error: " in line]
+    assert len(told) == 1, done.err[-2000:]
     assert "MB of free space for the features of 3 photos, found 0.3 MB" in told[0]

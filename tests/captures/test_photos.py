@@ -11,6 +11,7 @@ from support.poses import move
 from support.refusals import assert_reports, fails
 from support.rooms import (
     COUNT,
+    FEW,
     SIZE,
     assert_same_up_to_a_similarity,
     room_cameras,
@@ -142,7 +143,7 @@ def test_a_mis_registered_photo_is_registered_again(room, tmp_path, monkeypatch)
         return found
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", misled_once)
-    poses = poses_from_photos(folder, tmp_path / "poses")
+    poses = poses_from_photos(folder, tmp_path / "poses", PoseConfig(max_features=FEW))
     assert moved, "there was something to put right"
     capture = load_capture(poses.root, images=folder, test_every=0)
     assert_same_up_to_a_similarity(
@@ -264,7 +265,7 @@ def phone(tmp_path_factory):
         else:
             save(folder / "masks" / f"{index}.png", mask[::2, ::2])
     save(folder / "masks" / "nobody.png", np.ones((4, 4)))
-    config = PoseConfig(mapper="global")
+    config = PoseConfig(mapper="global", max_features=FEW)
     return folder, poses_from_photos(folder, tmp_path_factory.mktemp("poses"), config)
 
 
@@ -297,13 +298,13 @@ def test_photos_left_over_by_sequential_matching_are_matched_with_all(tmp_path, 
     """Each photo is matched with the next one only, which has no features: every second photo is blank."""
     monkeypatch.setattr(photos, "EXHAUSTIVE_LIMIT", 3)
     monkeypatch.setattr(mapping, "SEQUENTIAL_OVERLAP", 1)
-    cameras = room_cameras()
+    paths, cameras = (tmp_path / "photos", tmp_path / "out"), room_cameras()
     for index, camera in enumerate(cameras):
         save(tmp_path / "photos" / f"{index}.png", room_photo(camera))
         save(tmp_path / "photos" / f"{index}blank.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
     with pytest.raises(CaptureError, match="none of which could be registered"):
-        poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig(pairs="sequential"))
-    poses = poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig())
+        poses_from_photos(*paths, PoseConfig(pairs="sequential", max_features=FEW))
+    poses = poses_from_photos(*paths, PoseConfig(max_features=FEW))
     assert poses.registered == tuple(f"{index}.png" for index in range(COUNT))
     assert (
         f'found by the mapper "{poses.mapper}" after all pairs of the unregistered photos were matched'

@@ -3,11 +3,10 @@
 import importlib.util
 import io
 import json
-import os
-import subprocess
 import sys
 
 import pytest
+from support.forked_commands import Command
 
 from lexsplat import cli
 
@@ -24,17 +23,12 @@ def test_each_line_of_the_input_is_answered_with_a_line(monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_an_output_that_is_not_utf_8_gets_every_answer(tmp_path):
+def test_an_output_that_is_not_utf_8_gets_every_answer():
     lines = '{"ask": "mug", "id": "\\ud800"}\n{"ask": "mug", "threshold": [1]}\n🍎\nduck\n'
-    done = subprocess.run(
-        [sys.executable, "-m", "lexsplat", "ask", "demo", "--stdin", "--device", "cpu"],
-        input=lines.encode(),
-        capture_output=True,
-        env={**os.environ, "PYTHONIOENCODING": "cp1252"},
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
-    answers = [json.loads(line) for line in done.stdout.decode().splitlines()]
+    with Command("ask", "demo", "--stdin", "--device", "cpu", encoding="cp1252") as asked:
+        done = asked.ended(lines)
+    assert done.status == 0, done.err
+    answers = [json.loads(line) for line in done.out.splitlines()]
     assert [answer.get("present", "error") for answer in answers] == ["yes", "error", "unsure", "yes"]
     assert (answers[0]["id"], answers[2]["phrase"]) == ("\ud800", "🍎")
 

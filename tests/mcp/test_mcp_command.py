@@ -3,12 +3,13 @@
 import json
 import signal
 import socket
-import subprocess
-import sys
 
 import pytest
+from support.forked_commands import Command
+from support.warm_starts import Ended
 
 from lexsplat import cli
+from lexsplat.cli.waiting import LateProgress
 from lexsplat.scenes.library import Library
 
 
@@ -19,30 +20,29 @@ def free_port() -> str:
         return str(free.getsockname()[1])
 
 
-def run(*arguments, said="", patience=3600.0):
+def run(*arguments: str, said: str = "", patience: float = 3600.0) -> Ended:
     """The end of a server whose client says something and leaves; it shows waits beyond the patience in seconds."""
-    program = (
-        "import sys; from lexsplat import cli; from lexsplat.cli.waiting import LateProgress\n"
-        f"LateProgress.__init__.__defaults__ = ({patience},)\n"
-        f"sys.exit(cli.main({['mcp', 'demo', *arguments]}))"
-    )
-    command = [sys.executable, "-c", program]
-    return subprocess.run(command, input=said, capture_output=True, text=True, timeout=300)
+
+    def wait() -> None:
+        LateProgress.__init__.__defaults__ = (patience,)
+
+    with Command("mcp", "demo", *arguments, prepare=wait) as server:
+        return server.ended(said)
 
 
 @pytest.mark.slow
 def test_a_client_that_leaves_at_once_leaves_a_server_that_ends_in_order():
     left = run()
-    assert (left.returncode, left.stderr) == (0, "")
+    assert (left.status, left.err) == (0, "")
 
 
 @pytest.mark.slow
 def test_progress_is_shown_on_standard_error_and_standard_output_is_the_protocol():
     left = run(said=json.dumps(INITIALIZE) + "\n", patience=0.0)
-    assert left.returncode == 0
-    assert "start: 0:00 so far" in left.stderr
-    assert "scene: 0:00 so far" in left.stderr
-    assert [json.loads(line)["id"] for line in left.stdout.splitlines()] == [1]
+    assert left.status == 0
+    assert "start: 0:00 so far" in left.err
+    assert "scene: 0:00 so far" in left.err
+    assert [json.loads(line)["id"] for line in left.out.splitlines()] == [1]
 
 
 def test_opening_scenes_and_a_library_sends_events_of_progress(tmp_path, monkeypatch, free_port, capsys):
@@ -64,13 +64,13 @@ def test_a_taken_port_and_a_foreign_address_end_in_one_line():
         taken.listen()
         port = taken.getsockname()[1]
         refused = run("--http", "--port", str(port))
-    assert refused.returncode == 1
-    assert len(refused.stderr.splitlines()) == 1
-    assert f"{port} is taken" in refused.stderr
+    assert refused.status == 1
+    assert len(refused.err.splitlines()) == 1
+    assert f"{port} is taken" in refused.err
     foreign = run("--http", "--host", "host.invalid", "--token", "0123456789abcdef")
-    assert foreign.returncode == 1
-    assert len(foreign.stderr.splitlines()) == 1
-    assert "host.invalid" in foreign.stderr
+    assert foreign.status == 1
+    assert len(foreign.err.splitlines()) == 1
+    assert "host.invalid" in foreign.err
 
 
 INITIALIZE = {
@@ -89,25 +89,13 @@ INITIALIZE = {
 @pytest.mark.parametrize("over", ["stdio", "http"])
 def test_ctrl_c_ends_a_server_in_order_though_its_client_stays(over, free_port):
     words = ["mcp", "demo", *(["--http", "--port", free_port] if over == "http" else [])]
-    # A job in the background is started with Ctrl-C ignored.
-    program = (
-        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        f"from lexsplat import cli; sys.exit(cli.main({words}))"
-    )
-    pipe = subprocess.PIPE
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stdin=pipe, stdout=pipe, stderr=pipe, text=True
-    ) as server:
-        try:
-            if over == "stdio":
-                server.stdin.write(json.dumps(INITIALIZE) + "\n")
-                server.stdin.flush()
-            assert server.stdout.readline()
-            server.send_signal(signal.SIGINT)
-            assert server.wait(60) == 0
-            assert "stopped" not in server.stderr.read()
-        finally:
-            server.kill()
+    with Command(*words) as server:
+        if over == "stdio":
+            server.say(json.dumps(INITIALIZE) + "\n")
+        assert server.stdout.readline()
+        server.send_signal(signal.SIGINT)
+        assert server.wait(60) == 0
+        assert "stopped" not in server.errors()
 
 
 def test_a_server_over_http_states_its_address(monkeypatch, free_port, capsys):

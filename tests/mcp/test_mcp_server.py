@@ -2,13 +2,12 @@
 """The MCP server, through the client of the official package."""
 
 import asyncio
-import contextlib
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -19,6 +18,7 @@ import httpx2
 from mcp import Client
 from mcp.client.stdio import StdioServerParameters
 from mcp.server import MCPServer
+from support.forked_commands import Command, startable
 from support.mcp_clients import ask, served, talk
 from support.schemas import validated
 
@@ -330,15 +330,15 @@ def test_elsewhere_a_token_is_needed(scenes):
 
 @pytest.mark.slow
 def test_over_standard_input_and_output_and_a_killed_server_is_noticed():
-    command = [sys.executable, "-m", "lexsplat", "mcp", "demo"]
-
-    async def run():
-        started = StdioServerParameters(command=command[0], args=command[1:], env=dict(os.environ))
+    async def run(program, *words):
+        started = StdioServerParameters(command=program, args=words, env=dict(os.environ))
         async with Client(started) as client:
             reply = await client.call_tool("find", {"phrase": "where is the vase?"})
             assert reply.structured_content["phrases"][0]["present"] == "yes"
 
-    asyncio.run(run())
+    with startable("mcp", "demo") as words:
+        asyncio.run(run(*words))
+    command = [sys.executable, "-m", "lexsplat", "mcp", "demo"]
     killed = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     killed.kill()
     _, errors = killed.communicate(timeout=30)
@@ -351,34 +351,21 @@ def test_a_server_that_is_killed_while_it_is_asked_is_an_error_for_its_client_an
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    command = [sys.executable, "-m", "lexsplat", "mcp", "demo", "--http", "--port", str(port)]
     url = f"http://127.0.0.1:{port}/mcp"
 
     def started():
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        for _ in range(1200):
-            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1):
-                return process
-            time.sleep(0.1)
-        process.kill()
-        raise AssertionError("the server does not listen")
+        server = Command("mcp", "demo", "--http", "--port", str(port))
+        assert b"served at" in server.stdout.readline()
+        return server
 
-    async def ask_and_kill(process):
+    async def ask_and_kill(server):
         async with Client(url) as client:
             assert not (await client.call_tool("count", {"phrase": "mug"})).is_error
-            process.kill()
-            process.wait(30)
+            server.send_signal(signal.SIGKILL)
+            server.wait(30)
             await asyncio.wait_for(client.call_tool("count", {"phrase": "vase"}), 60)
 
-    process = started()
-    try:
-        with pytest.raises(BaseException):  # noqa: B017  (any error, but no answer and no hanging)
-            asyncio.run(ask_and_kill(process))
-    finally:
-        process.kill()
-    process = started()
-    try:
+    with started() as server, pytest.raises(BaseException):  # noqa: B017  (any error, but no answer and no hanging)
+        asyncio.run(ask_and_kill(server))
+    with started():
         assert ask(url, "count", phrase="vase")[0].structured_content["count"] == 1
-    finally:
-        process.kill()
-        process.wait(30)

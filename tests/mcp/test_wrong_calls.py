@@ -3,8 +3,6 @@
 import asyncio
 import json
 import os
-import subprocess
-import sys
 
 import pytest
 
@@ -12,6 +10,7 @@ pytest.importorskip("mcp")
 from mcp import Client, MCPError
 from mcp.client.stdio import StdioServerParameters
 from mcp.server import MCPServer
+from support.forked_commands import Command, startable
 from support.mcp_clients import ask, served, talk
 
 from lexsplat.mcp.server import http_app, make_server
@@ -143,10 +142,8 @@ def test_over_http_wrong_calls_are_refused_in_the_same_lines(scenes, tmp_path):
 
 @pytest.mark.slow
 def test_over_standard_input_and_output_wrong_calls_are_refused_in_the_same_lines(tmp_path):
-    command = ["-m", "lexsplat", "mcp", "demo", "--allow-write", "--output", str(tmp_path)]
-    asyncio.run(
-        _all_hostile(StdioServerParameters(command=sys.executable, args=command, env=dict(os.environ)))
-    )
+    with startable("mcp", "demo", "--allow-write", "--output", str(tmp_path)) as (program, *words):
+        asyncio.run(_all_hostile(StdioServerParameters(command=program, args=words, env=dict(os.environ))))
 
 
 @pytest.mark.parametrize(
@@ -233,22 +230,15 @@ LINES = [  # what a client sends, and the id and a part of its answer
 
 @pytest.mark.slow
 def test_each_line_of_standard_input_gets_one_answer_whatever_it_holds():
-    started = subprocess.Popen(
-        [sys.executable, "-m", "lexsplat", "mcp", "demo"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
-    started.stdin.write(json.dumps(INITIALIZE).encode() + b"\n")
-    started.stdin.write(b'{"jsonrpc": "2.0", "method": "notifications/initialized"}\n\n \r\n')
-    started.stdin.flush()
-    assert json.loads(started.stdout.readline())["id"] == 0
-    for sent, identity, told in LINES:
-        started.stdin.write(sent + b"\n")
-        started.stdin.flush()
-        answer = started.stdout.readline().decode()
-        assert json.loads(answer)["id"] == identity, sent[:100]
-        assert told in answer
-    _, errors = started.communicate(timeout=60)
-    assert started.returncode == 0
-    assert b"Traceback" not in errors
+    with Command("mcp", "demo") as started:
+        started.say(json.dumps(INITIALIZE) + "\n")
+        started.say('{"jsonrpc": "2.0", "method": "notifications/initialized"}\n\n \r\n')
+        assert json.loads(started.stdout.readline())["id"] == 0
+        for sent, identity, told in LINES:
+            started.say(sent.decode("utf-8", "surrogateescape") + "\n")
+            answer = started.stdout.readline().decode()
+            assert json.loads(answer)["id"] == identity, sent[:100]
+            assert told in answer
+        left = started.ended(seconds=60)
+    assert left.status == 0
+    assert "Traceback" not in left.err

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 from support.rooms import (
     COUNT,
+    FEW,
     SIZE,
     assert_same_up_to_a_similarity,
     room_cameras,
@@ -21,7 +22,7 @@ from support.rooms import (
 from support.written_captures import save
 
 from lexsplat import cli
-from lexsplat.captures import load_annotations, load_capture, poses_from_photos
+from lexsplat.captures import PoseConfig, load_annotations, load_capture, poses_from_photos
 from lexsplat.pipeline.inputs import reload_capture
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.progress import Event
@@ -29,7 +30,7 @@ from lexsplat.scenes.folder import SceneFolder
 
 pytestmark = pytest.mark.slow
 
-QUICK = ["--device", "cpu", "--iterations", "2", "--downscale", "4"]
+QUICK = ["--device", "cpu", "--iterations", "2", "--downscale", "4", "--poses.max-features", str(FEW)]
 
 
 def run(command: str, capture, output, *further: str) -> int:
@@ -130,7 +131,7 @@ def test_an_output_that_is_the_photos_folder_is_refused(photos, capsys):
 
 
 def test_a_run_that_was_stopped_goes_on_with_its_features(tmp_path):
-    folder, output = tmp_path / "photos", tmp_path / "out"
+    folder, output, config = tmp_path / "photos", tmp_path / "out", PoseConfig(max_features=FEW)
     for index, camera in enumerate(room_cameras()):
         save(folder / f"{index}.png", room_photo(camera))
 
@@ -139,7 +140,7 @@ def test_a_run_that_was_stopped_goes_on_with_its_features(tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        poses_from_photos(folder, output, listener=stop)
+        poses_from_photos(folder, output, config, listener=stop)
     assert (output / ".poses" / "database.db").is_file()
     assert not (output / "sparse").exists()
     # Nothing is left to be seen in the photos: what is registered now is registered by features that were kept.
@@ -148,7 +149,7 @@ def test_a_run_that_was_stopped_goes_on_with_its_features(tmp_path):
         Image.new("RGB", SIZE).save(file)
         file.write_bytes(file.read_bytes().ljust(size, b"\0"))
         os.utime(file, ns=(times, times))
-    poses = poses_from_photos(folder, output)
+    poses = poses_from_photos(folder, output, config)
     assert len(poses.registered) == COUNT
     views = load_capture(output, images=folder, test_every=0).views
     assert_same_up_to_a_similarity([views[f"{i}.png"].camera for i in range(COUNT)], room_cameras())

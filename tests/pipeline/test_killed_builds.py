@@ -14,10 +14,20 @@ from support.killed_builds import KILLS_A_SCENE
 from support.tiny_capture import write_capture
 
 STAGES = {
-    "averaged": ["reconstruct", "features", "average"],
+    "averaged": ["average"],
     "trained": ["reconstruct", "features", "codebook", "language"],
 }
-"""Methods and their stages, by the names of their progress events."""
+"""Methods and the stages inside which they are killed, by the names of their progress events.
+
+The stages that both methods have are killed with one of them.
+"""
+
+ROUNDING = 2.0**-12
+"""A resumed run encodes the crops of the photos that are left in other batches than an undisturbed one.
+
+The last bit of a product depends on the number of rows on some processors. Rarely a feature is then rounded to the
+next number of half precision, which is 2^-12 away below 0.5. A codeword is a mean of features, so it moves by less.
+"""
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +41,7 @@ def killed(tmp_path_factory) -> dict[str, dict]:
         "build", str(capture), "--clip", "bundled", "--dino", "bundled", "--device", "cpu",
         "--features.crop-sizes", "0.5", "--features.crop-strides", "0.5", "--features.map-cells", "16",
         "--features.max-short-side", "36", "--features.dino-short-side", "48",
-        "--iterations", "90", "--codebook.num-codes", "16", "--trained.iterations", "40",
+        "--iterations", "60", "--codebook.num-codes", "16", "--trained.iterations", "30",
         "--checkpoint-seconds", "0.05",
     ]  # fmt: skip
     command = [sys.executable, "-m", "support.killed_builds", str(folder), json.dumps(STAGES), *options]
@@ -68,8 +78,7 @@ def test_kills_over_all_stages_do_not_change_the_result(killed, method):
         found = tensors(scene)
         assert found.keys() == language.keys()
         for name, tensor in language.items():
-            # A codebook is fitted anew, with matrix products whose last bit depends on how many threads were free.
-            tolerance = 1e-6 if name.startswith("codebook.") else 0.0
+            tolerance = ROUNDING if name.startswith("codebook.") else 0.0
             torch.testing.assert_close(found[name], tensor, rtol=0, atol=tolerance)
         assert not list(scene.rglob("*.tmp")), "half-written files are removed"
         assert not list((scene / "checkpoints").glob("*.training.safetensors"))

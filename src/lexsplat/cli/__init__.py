@@ -85,9 +85,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.getLogger("lexsplat").setLevel(NOTE)
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        status = _run(words)
-        if sys.stdout is not None:  # None if it is closed, as in `lexsplat info SCENE >&-`
-            sys.stdout.flush()  # here, so that a reader that has ended is noticed below
+        try:
+            status = _run(words)
+        except SystemExit:  # after a help page
+            _flush()
+            raise
+        _flush()
         return status
     except LexsplatError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
@@ -164,6 +167,12 @@ def _run(words: list[str]) -> int:
             remedy="run the same command again, with its output read to the end or written to a file",
         ) from error
     return 0
+
+
+def _flush() -> None:
+    """Write what is left of the output, so that `main` notices a reader that has ended, before the interpreter does."""
+    if sys.stdout is not None:  # None if it is closed, as in `lexsplat info SCENE >&-`
+        sys.stdout.flush()
 
 
 def _discard_output() -> None:
