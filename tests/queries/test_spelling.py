@@ -1,5 +1,6 @@
-"""Words of the dictionary, without reading it where everybody knows them."""
+"""Words of the dictionary, without reading it where everybody knows them, and singulars."""
 
+import pytest
 import simplemma
 
 from lexsplat.queries import spelling
@@ -17,3 +18,12 @@ def test_an_everyday_word_is_known_without_the_dictionary_and_others_are_looked_
     assert [spelling.is_word(word) for word in ("Shoe", "blue", "ibex", "shoo")] == [True, True, True, False]
     assert asked == ["ibex", "shoo"]
     assert "shoe" in everyday_words()
+
+
+@pytest.mark.parametrize(
+    ("plural", "one"),
+    [("loaves", "loaf"), ("loaves of bread", "loaf of bread"), ("calves", "calf"), ("thieves", "thief"),
+     ("knives", "knife"), ("gloves", "glove"), ("olives", "olive"), ("stoves", "stove")],
+)  # fmt: skip
+def test_plurals_of_f_have_their_singular(plural, one):
+    assert spelling.singular(plural) == one
