@@ -78,6 +78,37 @@ def test_a_number_is_exact_where_it_is_asked_so(select, text, count):
 
 
 @pytest.mark.parametrize(
+    ("text", "present", "count"),
+    [("at most two apples", "yes", 2), ("fewer than two apples", "no", 0), ("no apples", "no", 0),
+     ("is there no bottle?", "yes", 0), ("fewer than two bottles", "yes", 0), ("at most two boards", "unsure", 1),
+     ("are there no boards?", "unsure", 0)],
+)  # fmt: skip
+def test_little_of_a_thing_holds_where_there_is_none(select, text, present, count):
+    words = {
+        "apple": select("apple", "other apple"),
+        "bottle": replace(select("pole"), present="no"),
+        "board": replace(select("board"), present="unsure"),
+    }
+    found = asked(text, words)
+    assert (found.present, found.count, bool(found)) == (present, count, count > 0)
+
+
+def test_lengths_and_widths_are_those_of_boxes(select):
+    words = {name: select(name) for name in ("apple", "board", "pole")}
+    assert asked("is the pole longer than the board?", words).present == "yes"
+    assert asked("is the board wider than the pole?", words).present == "yes"
+    assert asked("is the pole wider than the board?", words).present == "no"
+
+
+def test_a_statement_on_a_superlative_holds_for_the_thing_that_it_names(select):
+    words = {name: select(name) for name in ("apple", "board", "pole")}
+    objects = tuple(words.values())
+    assert asked("is the pole the tallest object?", words, objects).num_gaussians == 200
+    assert asked("is the apple the tallest object?", words, objects).present == "no"
+    assert asked("is the apple not the tallest object?", words, objects).present == "yes"
+
+
+@pytest.mark.parametrize(
     ("text", "name"),
     [
         ("the widest thing", "board"),

@@ -276,10 +276,9 @@ def test_what_a_question_asks_beside_the_thing_is_reported(text, expected, told)
         ("turn on the lamp", "turn"),
         ("Half of the mugs", "Half"),
         ("WHY is it red", "WHY"),
-        ("at most two toys", "at"),
         ("0 toys", "0"),
         ("at least 0 toys", "0"),
-        ("fewer than five apples", "fewer"),
+        ("fewer than zero apples", "fewer"),
     ],
 )
 def test_a_note_on_what_is_not_understood_names_a_word_in_its_own_letters(text, told):

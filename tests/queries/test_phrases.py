@@ -227,8 +227,6 @@ def test_questions_as_people_ask_them_are_understood(text, expected):
         ("pick up the mug and put it on the cloth", "it"),
         ("go to the mug then turn left", "then"),
         ("is it safe to lift the mug?", "it"),
-        ("neither the mug nor the duck", "neither"),
-        ("at most three mugs", "at"),
         ("mugs next to each other", "each"),
         ("all the other mugs", "other"),
         ("are all mugs red?", "are"),

@@ -1,4 +1,4 @@
-"""Words of the dictionary: that of simplemma, without reading it where everybody knows them, and kept sorted."""
+"""Words of the dictionary: that of simplemma, without reading it where everybody knows them, kept sorted, and singulars."""
 
 import random
 
@@ -70,3 +70,12 @@ def test_words_are_known_where_nothing_can_be_written(no_words_yet, monkeypatch)
     monkeypatch.setattr(dictionary, "write_file", refused)
     assert dictionary.is_english("ibex")
     assert not no_words_yet.exists()
+
+
+@pytest.mark.parametrize(
+    ("plural", "one"),
+    [("loaves", "loaf"), ("loaves of bread", "loaf of bread"), ("calves", "calf"), ("thieves", "thief"),
+     ("knives", "knife"), ("gloves", "glove"), ("olives", "olive"), ("stoves", "stove")],
+)  # fmt: skip
+def test_plurals_of_f_have_their_singular(plural, one):
+    assert spelling.singular(plural) == one

@@ -150,7 +150,8 @@ class Tools:
         viewer = VIEWER.match(second.strip())
         both = place.understand(first), Understood(Viewer()) if viewer else place.understand(second)
         related = Related(relation, both[0].phrase, both[1].phrase)
-        asked = Understood(related, "", any(each.unknown for each in both))
+        unknown, unread = (any(getattr(each, name) for each in both) for name in ("unknown", "unread"))
+        asked = Understood(related, "", unknown, unread)
         found = find_in(place, asked, place.camera(view) if view else None, None)
         holds = {"yes": "Yes", "unsure": "Perhaps", "no": "No"}[found.present]
         answer = {

@@ -90,8 +90,9 @@ def answer(phrase: Phrase, searched: Searched) -> Selection:
         selected = searched.select(phrase.text)
         return _joined(selected, members, present="yes") if members else apart(selected, searched)
     found = _ANSWERS[type(phrase)](phrase, searched)
-    # An empty result is a "no", whatever the presence of the parts; a "no" has no instances.
-    if not found or found.present == "no":
+    # An empty result is a "no", whatever the presence of the parts, unless none is asked for.
+    may_be_none = isinstance(phrase, AtLeast) and phrase.count == 0
+    if (not found and not may_be_none) or found.present == "no":
         found = replace(found, mask=torch.zeros_like(found.mask), parts=(), present="no")
     return replace(found, phrase=str(phrase))
 
@@ -281,9 +282,22 @@ def _pick(phrase: Pick, searched: Searched) -> Selection:
 
 def _at_least(phrase: AtLeast, searched: Searched) -> Selection:
     found = answer(phrase.target, searched)
+    if phrase.count == 0:
+        return _at_most(phrase, found)
     if phrase.count <= found.count <= (found.count if phrase.most is None else phrase.most):
         return found
     return replace(_joined(found, ()), note=f"{found.count} found of {phrase.target}")
+
+
+def _at_most(phrase: AtLeast, found: Selection) -> Selection:
+    """What is found, if it is little enough: if it is nothing, the answer is "yes" without instances."""
+    count = len(_certain(found))
+    fits, note = count <= (phrase.most or 0), f"{count} found of {phrase.target}"
+    if found.present == "unsure":
+        return found if fits else replace(_joined(found, ()), note=note)
+    if count == 0:
+        return replace(_joined(found, ()), present="yes", note=note)
+    return found if fits else replace(_joined(found, ()), present="no", note=note)
 
 
 def _every(phrase: Every, searched: Searched) -> Selection:

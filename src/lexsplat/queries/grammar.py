@@ -73,17 +73,20 @@ from lexsplat.queries.questions import (
     asks_yes_or_no,
     at_one_moment,
     command_note,
-    in_full,
     not_in_answer,
     not_understood,
     says_more,
     states,
     with_asking_words,
 )
+from lexsplat.queries.rewording import in_full
 from lexsplat.queries.spelling import singular, straight_quotes
+from lexsplat.queries.statements import neither, stated_of_two
 from lexsplat.queries.vocabulary import QUALITIES, SURFACES
 from lexsplat.queries.wording import (
+    IncompleteError,
     all_qualities,
+    counted,
     describes,
     in_own_letters,
     is_place,
@@ -104,10 +107,6 @@ MAX_LENGTH = 600
 """Characters from which a text is one thing: no phrase of that length has grammar."""
 
 
-class _IncompleteError(Exception):
-    """A phrase is incomplete. The message is the word that is not understood, such as an "on" at its end."""
-
-
 def understand(text: str) -> Understood:
     """A phrase or question, parsed.
 
@@ -116,7 +115,7 @@ def understand(text: str) -> Understood:
     """
     text = straight_quotes(text)
     if len(text) > MAX_LENGTH:
-        return Understood(Thing(text.strip()), "too long for grammar: asked for as one thing", unknown=True)
+        return Understood(Thing(text.strip()), "too long for grammar: asked for as one thing", True, True)
     if text.count('"') % 2:
         raise QueryError(f"phrase {text!r}", expected="quotation marks in pairs", found="an odd number")
     # Quoted parts are replaced by a character that no pattern contains.
@@ -130,11 +129,11 @@ def understand(text: str) -> Understood:
     asked, moment = at_one_moment(in_full(mended_text))
     parser = _Parser(text, together=asks_yes_or_no(asked), stated=states(asked))
     aside = not_in_answer(asked)
-    unknown = aside.startswith('"')
+    unknown, unread = aside.startswith('"'), False
     try:
         parsed = parser.whole_phrase(asked)
-    except _IncompleteError as incomplete:
-        parsed, unknown = Thing(plain), True
+    except IncompleteError as incomplete:
+        parsed, unknown, unread = Thing(plain), True, True
         quote = own_words(str(incomplete), plain)
         note = f'not understood ("{quote}"): asked for as one thing, in these words'
     else:
@@ -147,7 +146,7 @@ def understand(text: str) -> Understood:
             moment,
         )
         note = in_own_letters("; ".join(filter(None, told)), plain)
-    return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note, unknown)
+    return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note, unknown, unread)
 
 
 def _unhidden(thing: Thing, quoted: list[str]) -> Thing:
@@ -156,7 +155,7 @@ def _unhidden(thing: Thing, quoted: list[str]) -> Thing:
         raise QueryError(
             "phrase", expected="a thing in the quotation marks", found="nothing", remedy='such as "red mug"'
         )
-    return Thing(shown, exact=shown != thing.text)
+    return replace(thing, text=shown, exact=shown != thing.text)
 
 
 class _Parser:
@@ -171,16 +170,16 @@ class _Parser:
         """A question or a phrase that is complete, and whose things are things.
 
         Raises:
-            _IncompleteError: If it is not so.
+            IncompleteError: If it is not so.
         """
         if not asked.strip(string.punctuation + " "):
-            raise _IncompleteError("")
+            raise IncompleteError("")
         parsed = self.question(asked)
         for thing in things_of(parsed):
             if left := not_understood(patterns.HIDDEN.sub("thing", thing)):
-                raise _IncompleteError(left)
+                raise IncompleteError(left)
         if has_stray_viewer(parsed):
-            raise _IncompleteError("me")
+            raise IncompleteError("me")
         return parsed
 
     def question(self, asked: str) -> Phrase:
@@ -194,9 +193,12 @@ class _Parser:
                 patterns.COMPARATIVES[found["more"].lower()] if found["more"] else picked(found), these
             )
         if self.stated and is_place(as_phrase(asked)):  # is on the table
-            raise _IncompleteError(asked.split()[0])
+            raise IncompleteError(asked.split()[0])
         if self.stated and (word := says_more(asked)):
-            raise _IncompleteError(word)
+            raise IncompleteError(word)
+        of_two = stated_of_two(asked, self.phrase) if self.stated and not asks_for_all(asked) else None
+        if of_two is not None:
+            return loosened(of_two, False)
         parsed = loosened(self.phrase(as_phrase(asked)), self.together)
         if not asks_for_all(asked):
             return of_the_picked(parsed) if self.stated else parsed
@@ -215,6 +217,10 @@ class _Parser:
             return Viewer()
         if found := patterns.NOT.match(words):
             return Except(Anything(), self.phrase(words[found.end() :], deeper))
+        if found := patterns.NONE_OF.match(words):
+            return AtLeast(0, self.phrase(words[found.end() :], deeper), 0)
+        if (others := neither(words, lambda part: self.phrase(part, deeper))) is not None:
+            return others
         words = re.sub(r"\s*,\s*(?=(?:that|which|who)\s)", " ", words)
         if found := patterns.BETWEEN.match(f" {words}"):
             target, negated, first, second = found.groups()
@@ -254,7 +260,7 @@ class _Parser:
         if is_place(parts[1]) and patterns.BUT.search(f" {words} "[len(parts[0]) :]):  # but left of the mug
             return self.phrase(f"{parts[0]} and {parts[1]}", depth)
         if patterns.ONLY.match(parts[1]):
-            raise _IncompleteError(parts[1].split()[0])
+            raise IncompleteError(parts[1].split()[0])
         if (named := parts[0].strip()) and parts[1].strip().lower() in ("one", "two"):  # the largest but one
             return Thing(words)
         first = Anything() if not named or patterns.ALL.match(named) else self.phrase(named, depth)
@@ -306,13 +312,13 @@ class _Parser:
         if joint.endswith("or") and isinstance(first, (Related, Between, InCorner, InPart)):
             return Both(first, placed(place, first.target))
         if not is_placed and joint != ",":
-            raise _IncompleteError(joint)
+            raise IncompleteError(joint)
         return placed(place, first)
 
     def second_reference(self, first: Related, second: Phrase, joint: str) -> Phrase:
         """ "What is next to the mug and the duck": things next to both. With "on", things on either."""
         if first.relation in ORDERED or not isinstance(second, (Thing, Both, Together)):
-            raise _IncompleteError(joint)
+            raise IncompleteError(joint)
         one_of = joint.endswith("or") or first.relation in ("on", "inside", "under", "below")
         if one_of or not isinstance(second, Thing):
             return Both(first, replace(first, reference=second))
@@ -323,18 +329,12 @@ class _Parser:
         if found := patterns.OF_TWO.match(words):
             rest = undetermined(words[found.end() :]) or "thing"
             return Pick(patterns.COMPARATIVES[found["more"].lower()], self.phrase(rest, depth))
-        bare, before = patterns.THE_ONE.sub("thing ", words), None
-        quantity, rank, exact = 0, 0, False
-        while bare != before:
-            before = bare
-            if not rank and (found := patterns.ORDINAL.match(bare)):
-                rank, bare = number(found["number"]), bare[found.end() :]
-            if not quantity and (found := patterns.QUANTITY.match(bare)):
-                quantity, bare = number(found["number"]) + bool(found["more"]), bare[found.end() :]
-                exact = bool(found["exact"])
-                if not quantity:
-                    raise _IncompleteError(found["number"])
-            bare = patterns.DETERMINER.sub("", bare)
+        if found := patterns.AT_MOST.match(words):
+            most = number(found["number"]) - bool(found["below"])
+            if most < 0:
+                raise IncompleteError(found["number"])
+            return AtLeast(0, self.phrase(words[found.end() :], depth), most)
+        bare, quantity, rank, exact = counted(patterns.THE_ONE.sub("thing ", words))
         if quantity > 1 or rank or exact:
             asides = re.match(r"(?:from|to|on|at)\s", bare, re.IGNORECASE)
             target = self.phrase(f"thing {bare}" if asides else bare, depth)
@@ -397,7 +397,7 @@ class _Parser:
         if reference.lower() in QUALITIES and relation == "inside":  # a car in red
             return self.thing(f"{reference} {target}")
         if not reference:
-            raise _IncompleteError(found[0].strip())
+            raise IncompleteError(found[0].strip())
         if patterns.TO_A_SIDE.match(reference):
             return None  # mug on the left
         things = self.phrase(target, depth) if target else Anything()
@@ -442,5 +442,5 @@ class _Parser:
         if found := patterns.SOMETHING.match(words):
             return thing_of(f"something {found[1]}")
         if not words:
-            raise _IncompleteError("")
-        return thing_of(words if " to " in words or not_understood(words) else singular(words))
+            raise IncompleteError("")
+        return thing_of(words if " to " in words or not_understood(words) else singular(words), words)

@@ -57,7 +57,7 @@ def _graded(adjective: str) -> tuple[str, str]:
     return stem + "er", stem + "est"
 
 
-_CLOSED = frozenset(_FUNCTION_WORDS.split()).union(*map(_graded, _GRADED.split()))
+CLOSED = frozenset(_FUNCTION_WORDS.split()).union(*map(_graded, _GRADED.split()))
 _WORD = re.compile(r"[^\W_]+(?:['\u2019-][^\W_]+)*")
 _PART_WORD = (
     "middle|center|centre|back|front|rear|top|bottom|edge|border|side|end|rest|half|background|foreground"
@@ -91,6 +91,12 @@ _ARTICLE = re.compile(
     re.IGNORECASE,
 )
 """An article behind a word that joins nothing to it: "shelf holds the book"."""
+_DOES = re.compile(
+    r"\btouch(?:es|ing)\b|(?<!for )(?<!like )\b(?!\w+thing\b)\w+ing(?= (?:the|my|your|our|this|that) \w)|"
+    r"(?<=^something that )\w+s(?= (?:the|my|your|our|this|that) \w)",
+    re.IGNORECASE,
+)
+"""A verb that relates two things, of which the grammar has no relation: "apple touching the banana"."""
 _STARTS = re.compile(r"^(?:of|to|from|for|with|without|about|off|out|up|down|over|in|on)\b", re.IGNORECASE)
 _LATER = re.compile(r"(?<=\w )(?:from|about|off|out|up|down|in|on|over)\b", re.IGNORECASE)
 
@@ -106,14 +112,14 @@ def left_over(text: str) -> str:
     described = _DESCRIBES.match(text)
     verbs = described.end() if described else len(text)
     shown = _FIXED.sub(lambda found: "." * len(found[0]), text)
-    patterns = (_PART, _UNIT, _NUMBER, _STARTS, *(() if described else (_LATER, _ARTICLE)))
+    patterns = (_PART, _UNIT, _NUMBER, _DOES, _STARTS, *(() if described else (_LATER, _ARTICLE)))
     places = [found.span() for pattern in patterns if (found := pattern.search(shown))]
     for word in _WORD.finditer(shown):
         small, is_verb = word[0].lower(), described is not None and word.end() <= verbs
         allowed = (is_verb and small in ("that", "which", "who")) or (
             word.start() >= verbs and small in _VERB_PHRASE
         )
-        if small in _CLOSED and not allowed:
+        if small in CLOSED and not allowed:
             places.append(word.span())
             break
     if places:
@@ -131,11 +137,11 @@ def _size(text: str) -> str:
 
 FOR_PAGES = {
     "part_of": _PART, "unit": _UNIT, "numeral": _NUMBER, "fixed": _FIXED, "describes": _DESCRIBES,
-    "article": _ARTICLE, "starts": _STARTS, "later": _LATER,
+    "article": _ARTICLE, "does": _DOES, "starts": _STARTS, "later": _LATER,
 }  # fmt: skip
 """Patterns by which published pages find what names no thing (`lexsplat.scenes.publishing.grammar`)."""
 WORDS_FOR_PAGES = {
-    "closed": sorted(_CLOSED), "verb_phrase": sorted(_VERB_PHRASE), "sizes": _SIZES.split(),
+    "closed": sorted(CLOSED), "verb_phrase": sorted(_VERB_PHRASE), "sizes": _SIZES.split(),
     "relative": _RELATIVE.split(),
 }  # fmt: skip
 """Closed classes of words."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from lexsplat.queries.leftovers import NUMBERS, ORDINALS
+from lexsplat.queries.leftovers import CLOSED, NUMBERS, ORDINALS
 from lexsplat.queries.phrases import PartName, PickName, RelationName
 from lexsplat.queries.vocabulary import COLORS
 
@@ -27,6 +27,8 @@ RELATIONS: tuple[tuple[str, RelationName], ...] = (
     (r"smaller than", "smaller than"),
     (r"taller than", "taller than"),
     (r"shorter than", "shorter than"),
+    (r"longer than", "longer than"),
+    (r"(?:wider|broader) than", "wider than"),
 )  # fmt: skip
 LINK = (
     r"(?:(?:that|which|who)\s)?(?:(?:is|are|was|were|there|stands?|sits?|lies|lie|hangs?|rests?|standing|sitting|"
@@ -107,6 +109,7 @@ PICKS: tuple[tuple[str, PickName], ...] = (
 PICK_WORDS = "|".join(f"(?P<p{i}>{words})" for i, (words, _) in enumerate(PICKS))
 COMPARATIVES: dict[str, PickName] = {
     "bigger": "largest", "larger": "largest", "smaller": "smallest", "taller": "tallest", "shorter": "shortest",
+    "longer": "longest", "wider": "widest",
 }  # fmt: skip
 SIZES: dict[str, PickName] = {
     "big": "largest", "large": "largest", "huge": "largest", "small": "smallest", "little": "smallest",
@@ -143,6 +146,36 @@ QUANTITY = re.compile(
     r"\s+(?!(?:meters?|metres?|centimeters?|inch(?:es)?|feet|yards?|steps?|cm|mm|m)\b)(?:of\s+)?",
     re.IGNORECASE,
 )
+AT_MOST = re.compile(
+    r"^(?:(?P<below>(?:fewer|less) than)|at (?:the )?most|(?:no|not) more than|up to|(?:a )?maximum(?: of)?) "
+    rf"(?P<number>\d{{1,3}}|{'|'.join(NUMBERS)})"
+    r"\s+(?!(?:meters?|metres?|centimeters?|inch(?:es)?|feet|yards?|steps?|cm|mm|m)\b)(?:of\s+)?",
+    re.IGNORECASE,
+)
+NONE_OF = re.compile(r"^at most 0 ", re.IGNORECASE)
+"""`lexsplat.queries.questions.in_full` makes this of "is there no"; it holds for all that follows."""
+NEITHER = re.compile(
+    r"^(?:(?P<noun>.+?)\s(?:(?:that|which|who)\s)?(?:(?:is|are|was|were)\s)?)?neither\s(?P<one>.+?)\snor\s(?P<other>.+)$",
+    re.IGNORECASE,
+)
+CLOSER = re.compile(
+    r"^(?:is|are|was|were) (?P<one>.+?) (?:(?P<near>closer|nearer)|farther|further)(?: away)?"
+    r"(?: (?:to|from) (?P<to>.+?)(?=(?<= me| us) than | than .+ (?:is|are)$))?"
+    r" than (?P<other>(?!to\b|from\b).+?)(?: is| are)?$",
+    re.IGNORECASE,
+)
+"""Which of two things is closer, to whoever asks or to a third one. "Closer to A than B" may mean "than to B"."""
+_FUNCTION_WORDS = """
+    of to from for with about off out up down over in on like without plus minus except twice quite such really
+"""
+_NO_NOUN = "|".join(sorted(CLOSED.union(_FUNCTION_WORDS.split())))
+IDENTITY = re.compile(
+    rf"^(?:is|are|was|were) (?!there\b)(?P<one>(?:\S+ )*?(?!(?:{_NO_NOUN}|(?<!the )(?<!a )(?<!my )\w+ing) )"
+    r"\S+) "
+    r"(?P<not>not )?(?P<other>(?:the|an?) (?:.*\S))$",
+    re.IGNORECASE,
+)
+"""A statement on what a thing is: "is the lamp the tallest thing?"."""
 QUALITY = re.compile(
     r"\s(?:,\s*)?(?:that|which|who)\s(?:is|are|was|were|looks?|has|have)\s(not\s)?(.+)$", re.IGNORECASE
 )

@@ -11,7 +11,8 @@ if TYPE_CHECKING:
 
 RelationName = Literal[
     "left of", "right of", "in front of", "behind", "on", "under", "above", "below", "inside", "next to",
-    "nearest to", "farthest from", "larger than", "smaller than", "taller than", "shorter than",
+    "nearest to", "farthest from", "larger than", "smaller than", "taller than", "shorter than", "longer than",
+    "wider than",
 ]  # fmt: skip
 PickName = Literal[
     "largest", "smallest", "tallest", "shortest", "widest", "longest", "leftmost", "rightmost"
@@ -28,10 +29,17 @@ TO_VIEWER = ("left of", "right of", "in front of", "behind", "next to", *ORDERED
 
 @dataclass(frozen=True)
 class Thing:
-    """A thing to look for, in words for the text encoder; ``exact`` words were in quotation marks."""
+    """A thing to look for, in words for the text encoder.
+
+    Args:
+        text: The words, the last one in the singular.
+        exact: Whether they were in quotation marks.
+        own: The words as they were typed, if they are others: a plural.
+    """
 
     text: str
     exact: bool = field(default=False, compare=False)
+    own: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         return f'"{self.text}"'
@@ -166,13 +174,18 @@ class Pick:
 
 @dataclass(frozen=True)
 class AtLeast:
-    """All instances of ``target`` if there are at least ``count``, and at most ``most`` if given; otherwise none."""
+    """All instances of ``target`` if there are at least ``count``, and at most ``most`` if given; otherwise none.
+
+    A ``count`` of 0 holds without any: "no mugs", "at most two mugs".
+    """
 
     count: int
     target: Phrase
     most: int | None = None
 
     def __str__(self) -> str:
+        if self.count == 0:
+            return f"(at most {self.most} {self.target})" if self.most else f"(no {self.target})"
         return f"({'at least' if self.most is None else 'exactly'} {self.count} {self.target})"
 
 
@@ -213,14 +226,18 @@ class Understood:
         phrase: Things and relations that it names.
         note: Remark on parts not understood; "" if there are none.
         unknown: Whether nothing is certainly here: it holds words that the encoder does not know, or has no grammar.
+        unread: Whether it has no grammar: then nothing is certainly absent either.
     """
 
     phrase: Phrase
     note: str = ""
     unknown: bool = False
+    unread: bool = False
 
     def limit(self, present: Presence) -> Presence:
-        """The presence of its answer: "unsure" at most where nothing is certainly here."""
+        """The presence of its answer: "unsure" at most where nothing is certainly here, and at least where unread."""
+        if self.unread:
+            return "unsure"
         return "unsure" if self.unknown and present == "yes" else present
 
 
@@ -300,6 +317,13 @@ def things_of(phrase: Phrase) -> list[str]:
     if isinstance(phrase, Thing):
         return [phrase.text]
     return list(dict.fromkeys(text for part in parts_of(phrase).values() for text in things_of(part)))
+
+
+def own_words_of(phrase: Phrase) -> dict[str, str]:
+    """The words of the things of a phrase as they were typed, by their texts, where they are others."""
+    if isinstance(phrase, Thing):
+        return {phrase.text: phrase.own} if phrase.own else {}
+    return {text: own for part in parts_of(phrase).values() for text, own in own_words_of(part).items()}
 
 
 def with_things(phrase: Phrase, change: Callable[[Thing], Phrase]) -> Phrase:

@@ -7,8 +7,9 @@ from functools import lru_cache
 
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.leftovers import NUMBERS, ORDINALS, left_over
+from lexsplat.queries.rewording import CONTRACTIONS, REWORDED
 from lexsplat.queries.spelling import frame_errors
-from lexsplat.queries.vocabulary import COLORS, NAMES, PARTS, QUALITIES, STATES, default_vocabulary
+from lexsplat.queries.vocabulary import COLORS, QUALITIES, STATES, default_vocabulary
 
 _I = r"(?:i|we|you|one|someone|somebody|anyone|anybody|they|he|she|it)"
 _CAN = r"(?:can|could|would|will|may|might|should|do|did|does)"
@@ -38,20 +39,6 @@ _LEAVE = (
 )
 _ANY = r"(?:things?|objects?|items?|stuff|ones?)"
 
-_CONTRACTIONS = (
-    (r"[\u2018\u2019\u02bc]", "'"),
-    (r"\b(what|where|who|that|there|it|here|which|how)'s\b", r"\1 is"),
-    (r"\b(what|where|who|that|there|which|how|they|we|you)'re\b", r"\1 are"),
-    (r"\bcan't\b", "can not"),
-    (r"\bwon't\b", "will not"),
-    (r"n't\b", " not"),
-    (r"\bi'm\b", "i am"),
-    (r"\b(i|we|you)'ve\b", r"\1 have"),
-    (r"\b(i|we|you)'d\b", r"\1 would"),
-    (r"\b(what|where)s\b", r"\1 is"),
-    (r"\bgrey\b", "gray"),
-    (rf"\b({'|'.join(sorted(NAMES))})'s (?=\w)", r"\1 "),
-)
 _TAIL = re.compile(
     rf"[\s,;]+(?:please|pls|plz|thx|thanks|thank you|for me|for us|right now|at all|exactly|if any|then|{_HERE})$",
     re.IGNORECASE,
@@ -61,93 +48,6 @@ _TAG = re.compile(
     rf",\s*(?:right|correct|yes|no|or not|{_ROBOT}|(?:is|are|was|were|does|do) (?:it|they|there)(?: not)?|"
     r"(?:is|are) not (?:it|they|there)|is it not|are they not)$",
     re.IGNORECASE,
-)
-_NEGATIVE = re.compile(
-    r"^((?:(?:please|hey|hi|so|well|ok|okay)[\s,]+)*(?:is|are|was|were|does|did|has|had|"
-    r"(?:do|have|can|could|would)(?= not (?:i|we|you|they|it|there|the|my|any|all|some|these|those|this|that)\b)"
-    r")) not (?=\w+ \S)",
-    re.IGNORECASE,
-)
-"""A negative question; it asks what its positive statement asks."""
-_FIXED = (
-    "(?:handle|knob|spout|rim|wheel|tire|roof|wing|beak|head|face|nose|ear|eye|mouth|tail|belly|paw|leg|arm)"
-)
-"""Parts that do not lie about: a leaf on the table is none of the table."""
-_FLAT = "table|desk|tablecloth|cloth|floor|ground|shelf|bed|grass|sand|carpet|chair|sofa|bench"
-_OF_ITS_THING = re.compile(
-    rf"\b((?:{'|'.join(sorted(PARTS))})(?:e?s)?(?= of )|{_FIXED}s?(?= on (?!(?:\w+ ){{0,3}}(?:{_FLAT})\b)))"
-    r" (?:of|on) (?:(?:the|an?|my|your|this|that) )?"
-    r"((?:(?!(?:on|in|at|to|of|near|next|under|behind|beside|between|and|or|but|with|that|which|is|are)\b)[\w-]+ ){0,3}"
-    rf"(?:{'|'.join(sorted(NAMES))})s?)\b",
-    re.IGNORECASE,
-)
-"""A part of a thing: "the nose of the bear" and "the nose on the bear" ask for the bear nose."""
-_HAS_PART = re.compile(
-    rf"^(?:does|do|has|have) (?:(?:the|an?|my|your|this|that) )?((?:[\w-]+ ){{0,2}}(?:{'|'.join(sorted(NAMES))})s?) "
-    rf"(?:have |got )(?:(?:got|an?|any|the|some) )*((?:{'|'.join(sorted(PARTS))})(?:e?s)?)$",
-    re.IGNORECASE,
-)
-"""Whether a thing has a part: "does the mug have a handle" asks for the mug handle."""
-_HAS_PARTS = re.compile(
-    rf"^how many ((?:{'|'.join(sorted(PARTS))})(?:e?s)?) (?:does|do) (?:(?:the|an?|my|your|this|that) )?"
-    rf"((?:[\w-]+ ){{0,2}}(?:{'|'.join(sorted(NAMES))}))s? have$",
-    re.IGNORECASE,
-)
-"""How many parts a thing has: "how many wheels does the car have" counts the car wheels."""
-_NO_PART = re.compile(
-    rf"\b(?:(?:that|which|who) (?:has|have)|with) no (?=(?:{'|'.join(sorted(PARTS))})(?:e?s)?\b)",
-    re.IGNORECASE,
-)
-"""That a thing lacks a part: "bottle that has no cork" is a bottle without cork."""
-_REWORDED = (
-    (_HAS_PART, r"\1 \2"),
-    (_HAS_PARTS, r"how many \2 \1"),
-    (re.compile(rf"^(how many {_FIXED}s?) are on (?=\w)", re.IGNORECASE), r"\1 on "),
-    (re.compile(rf"\b(\d+|{'|'.join(NUMBERS)}) or more (?=\w)", re.IGNORECASE), r"at least \1 "),
-    (re.compile(r"^(what|which \w+) can be (?:seen|found|spotted) (?=\w)", re.IGNORECASE), r"\1 is "),
-    (re.compile(r"^how many ((?:\w+ ){1,3})(are|is) not (?=\w)", re.IGNORECASE), r"\1that \2 not "),
-    (re.compile(r"^what supports (?=(?:the|a|an|my|this|that) )", re.IGNORECASE), "what is under "),
-    (
-        re.compile(
-            r"^(where (?:is|are) .+) (?:standing|sitting|lying|located|placed|positioned|hanging)$",
-            re.IGNORECASE,
-        ),
-        r"\1",
-    ),
-    (
-        re.compile(
-            r"^(?:is|are) (.+) and (.+) ((?:right )?(?:next|close) to|near|beside) (?:each other|one another)$",
-            re.IGNORECASE,
-        ),
-        r"is \1 \3 \2",
-    ),
-    (_OF_ITS_THING, r"\2 \1"),
-    (_NO_PART, "without "),
-    (_NEGATIVE, r"\1 "),
-    (re.compile(r"\b(everything|anything|nothing|all)( else)? besides\b", re.IGNORECASE), r"\1 except"),
-    (
-        re.compile(
-            rf"\b(\w+) (?:of|in|with) (?:a |the )?({'|'.join(sorted(COLORS))}) colou?r\b", re.IGNORECASE
-        ),
-        r"\2 \1",
-    ),
-    (
-        re.compile(
-            r"^(?:is|are|was|were) (?:(?:the|this|that|these|those|my|our|your) )?"
-            r"((?:(?!(?:on|in|at|to|of|near|next|under|behind|beside|between|above|below|and|or|not|there)\b)[\w-]+ ){1,4})"
-            r"(?:made|built) (?:out )?(?:of|from) (?=\w+$)",
-            re.IGNORECASE,
-        ),
-        r"is there \1made of ",
-    ),
-    (
-        re.compile(
-            r"\b((?:larg|bigg|great|hug|small|tini|tall|high|short|low|near|clos|farth|furth)est|leftmost|rightmost)"
-            rf" (\d+|{'|'.join(NUMBERS)}) (?=\w)",
-            re.IGNORECASE,
-        ),
-        r"\2 \1 ",
-    ),
 )
 _MOVES = r"(?:move|turn|drive|go|navigate|walk|fly|run|lead|guide|take)"
 _CHANGES = r"(?:delete|remove|erase|hide|clean|push|pull|lift|throw)"
@@ -310,18 +210,6 @@ def _vocabulary() -> frozenset[str]:
     return frozenset(word for name in names for word in name.lower().split())
 
 
-def in_full(words: str) -> str:
-    """Words without contractions, "what is" for "what's", and a question without its "not".
-
-    "Isn't the mug on the table?" asks what "is the mug on the table?" asks.
-    """
-    for contraction, long in _CONTRACTIONS:
-        words = re.sub(contraction, long, words, flags=re.IGNORECASE)
-    for pattern, instead in _REWORDED:
-        words = pattern.sub(instead, words)
-    return words
-
-
 def as_phrase(words: str) -> str:
     """A question or request without the words around the thing: "where can I find the mug" is "the mug".
 
@@ -442,8 +330,8 @@ FOR_PAGES = {
 }  # fmt: skip
 """Patterns by which published pages read questions (`lexsplat.scenes.publishing.grammar`)."""
 REPLACED = {
-    "contractions": [(re.compile(pattern, re.IGNORECASE), instead) for pattern, instead in _CONTRACTIONS],
-    "reworded": list(_REWORDED),
+    "contractions": [(re.compile(pattern, re.IGNORECASE), instead) for pattern, instead in CONTRACTIONS],
+    "reworded": list(REWORDED),
     "frames": list(_COMPILED),
 }
 """Patterns and what pages put in their place, in this order."""

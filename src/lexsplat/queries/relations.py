@@ -83,8 +83,8 @@ def holds(relation: RelationName, target: Selection, reference: Selection, frame
     """
     if not target or not reference:
         return False
-    if relation in ("larger than", "taller than"):
-        measure = 0 if relation == "larger than" else 1
+    if relation in _LARGER:
+        measure = _LARGER.index(relation)
         return _sizes(target)[measure] > _sizes(reference)[measure]
     if relation in ("smaller than", "shorter than"):
         return holds("larger than" if relation == "smaller than" else "taller than", reference, target, frame)
@@ -306,9 +306,14 @@ def distance(first: Selection, second: Selection) -> float:
 # One relation each
 
 
-def _sizes(each: Selection) -> tuple[float, float]:
-    """The volume and the height of an object."""
-    return each.box.volume, float(each.box.half_sizes[2])
+_LARGER = ("larger than", "taller than", "longer than", "wider than")
+"""Relations by the `_sizes` that they compare."""
+
+
+def _sizes(each: Selection) -> tuple[float, float, float, float]:
+    """The volume of an object and half its height, its longest side and its longer horizontal side."""
+    along, across, height = (float(half) for half in each.box.half_sizes)
+    return each.box.volume, height, max(along, across, height), max(along, across)
 
 
 def _sideways(relation: str, target: Selection, reference: Selection, frame: Frame) -> bool:

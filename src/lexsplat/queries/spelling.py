@@ -11,7 +11,10 @@ from itertools import islice, product
 from lexsplat.queries import dictionary
 
 _SAME_FORM = {"glass", "cloth", "cutlery", "stairs", "people", "scissors", "trousers", "clothes", "pants"}
-_NOT_BY_LEMMA = {"leaves": "leaf", "shelves": "shelf", "lenses": "lens"}
+_NOT_BY_LEMMA = {
+    "leaves": "leaf", "shelves": "shelf", "lenses": "lens", "loaves": "loaf", "halves": "half", "calves": "calf",
+    "thieves": "thief", "wives": "wife", "lives": "life", "sheaves": "sheaf", "midwives": "midwife",
+}  # fmt: skip
 """Plurals that simplemma takes for verbs, or has under a rare spelling."""
 _SPELLINGS = 4
 """Maximum number of corrections of a phrase with several typing errors."""

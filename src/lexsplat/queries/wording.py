@@ -28,6 +28,10 @@ from lexsplat.queries.phrases import (
 from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, is_part_alone
 
 
+class IncompleteError(Exception):
+    """A phrase is incomplete. The message is the word that is not understood, such as an "on" at its end."""
+
+
 def own_words(left: str, plain: str) -> str:
     """Words of a text that were not understood, as the text spells them."""
     shown = " ".join(patterns.HIDDEN.sub(" ", plain).split())
@@ -58,14 +62,19 @@ def is_place(words: str) -> bool:
     return any((found := place.match(f" {words}")) is not None and not found[1] for place in places)
 
 
-def thing_of(text: str) -> Phrase:
-    """A thing by its words; "something red" and "red toy" are objects of the scene in a color."""
+def thing_of(text: str, own: str = "") -> Phrase:
+    """A thing by its words; "something red" and "red toy" are objects of the scene in a color.
+
+    Args:
+        text: The words, the last one in the singular.
+        own: The words as they were typed.
+    """
     words = text.lower().split()
     color, target = words.pop() if words[:1] == ["something"] else words.pop(0), " ".join(words)
     color = "gray" if color == "grey" else color
     if color in COLOR_WORDS and (target == "something" or is_kind(target)):
         return Colored(color, Anything() if target == "something" else Thing(target))
-    return Thing(text)
+    return Thing(text, own="" if own == text else own)
 
 
 def undetermined(words: str) -> str:
@@ -86,6 +95,26 @@ def number(word: str) -> int:
     if digits := re.match(r"\d+", small):
         return int(digits[0])
     return next((words.index(small) + 1 for words in (NUMBERS, ORDINALS) if small in words), 2)
+
+
+def counted(words: str) -> tuple[str, int, int, bool]:
+    """Words without the numbers and articles in front of them, the quantity, the rank, and whether it is exact.
+
+    Raises:
+        IncompleteError: If the quantity is 0.
+    """
+    before, quantity, rank, exact = "", 0, 0, False
+    while words != before:
+        before = words
+        if not rank and (found := patterns.ORDINAL.match(words)):
+            rank, words = number(found["number"]), words[found.end() :]
+        if not quantity and (found := patterns.QUANTITY.match(words)):
+            quantity, words = number(found["number"]) + bool(found["more"]), words[found.end() :]
+            exact = bool(found["exact"])
+            if not quantity:
+                raise IncompleteError(found["number"])
+        words = patterns.DETERMINER.sub("", words)
+    return words, quantity, rank, exact
 
 
 def describes(words: str) -> bool:

@@ -88,6 +88,12 @@ class Answers:
         made = word.selection
         return made if made.present == present else made.described(present=present)
 
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """The words that each prompt is asked for in: its own, or its singular where only that is here."""
+        words = self.words or (None,) * len(self)
+        return tuple((word and word.asked) or prompt for prompt, word in zip(self.prompts, words))
+
     def note(self, index: int) -> str:
         """How a prompt is answered, if as something else: "the handle of the mug"."""
         return self.words[index].note if self.words else ""
@@ -99,7 +105,7 @@ class Answers:
     def _selection(self, index: int) -> Selection:
         scores = self.words[index].scores if self.words else self.scores[index]
         threshold = float(self.thresholds[index])
-        phrase, present = self.prompts[index], self.presences[index]
+        phrase, present = self.asked[index], self.presences[index]
         selection = self.scene.selection(
             scores >= threshold, scores, threshold=threshold, present=present, phrase=phrase
         )
@@ -176,10 +182,12 @@ def answer_queries(
             "peak_view": names[0],
             "gaussians": len(found.selection(number)),
             "present": present,
-            "note": "; ".join(filter(None, (in_own_words(prompt, scene.clip).note, found.note(number)))),
+            "note": "; ".join(filter(None, (in_own_words(asked, scene.clip).note, found.note(number)))),
             "views": {},
         }
-        for number, (prompt, limit, present) in enumerate(zip(found.prompts, thresholds, found.presences))
+        for number, (prompt, asked, limit, present) in enumerate(
+            zip(found.prompts, found.asked, thresholds, found.presences)
+        )
     ]
     for done, name in enumerate(names):
         scene.listener(Event("views", done, len(names)))

@@ -13,6 +13,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.answering import Searched, answer
 from lexsplat.queries.grammar import understand
 from lexsplat.queries.kinds import with_unknown_words, words_of_things
+from lexsplat.queries.meaning import in_known_words, known_words
 from lexsplat.queries.phrases import Phrase, Thing, Understood, mended_note, things_of, with_things
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.spelling import spellings
@@ -41,7 +42,9 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
     if understood.unknown:
         return understood
     vocabulary = words_of_things(scene.clip)
+    known = known_words(scene.clip)
     mended: dict[str, str] = {}
+    otherwise: list[str] = []
 
     def mend(thing: Thing) -> Phrase:
         for meant in () if thing.exact else spellings(thing.text, vocabulary):
@@ -49,10 +52,13 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
                 typed = zip(thing.text.split(), meant.split())
                 mended.update({word: right for word, right in typed if word != right})
                 return thing_of(meant)
-        return thing
+        words = in_known_words(thing, lambda text: scene.ask(text, checked=True).presences[0], known)
+        if words not in (thing.text, thing.own):
+            otherwise.append(f'"{thing.text}" is asked for as "{words}"')
+        return thing if words == thing.text else Thing(words)
 
     found = with_things(understood.phrase, mend)
-    note = "; ".join(filter(None, (understood.note, mended_note(mended))))
+    note = "; ".join(filter(None, (understood.note, mended_note(mended), *otherwise)))
     return with_unknown_words(Understood(found, note), scene.clip)
 
 
@@ -93,13 +99,12 @@ def find_in(
 
     searched = Searched(select, viewer, lambda: scene.objects, lambda thing: object_colors(scene, thing))
     found = answer(understood.phrase, searched)
+    if found.present == "no" and threshold is None:
+        found = replace(found, mask=torch.zeros_like(found.mask), parts=())
     if (present := understood.limit(found.present)) != found.present:
         found = found.described(present=present)
     low = _too_low(answers, threshold) if answers is not None and threshold is not None else ()
-    found = found.described(note="; ".join(filter(None, (understood.note, found.note, *low))))
-    if found.present == "no" and threshold is None:
-        return replace(found, mask=torch.zeros_like(found.mask), parts=())
-    return found
+    return found.described(note="; ".join(filter(None, (understood.note, found.note, *low))))
 
 
 def _too_low(answers: Answers, threshold: float) -> Iterator[str]:

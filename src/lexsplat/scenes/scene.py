@@ -49,7 +49,8 @@ from lexsplat.runtime.device import choose_device
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.lazy import at_first_call
 from lexsplat.runtime.progress import Listener, silent
-from lexsplat.scenes.answers import Answers, automatic_thresholds, in_own_words
+from lexsplat.scenes.answers import Answers, automatic_thresholds
+from lexsplat.scenes.asking import in_words_that_fit
 from lexsplat.scenes.finding import find_in, understood_in
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.kept import KeptObjects, kept_objects_of, seen_of
@@ -243,7 +244,7 @@ class Scene:
         words = [word for prompt in prompts if (word := found[prompt]) is not None]
         presences = tuple(word.presence for word in words)
         if not checked:
-            presences = tuple(map(Understood.limit, (in_own_words(p, self.clip) for p in prompts), presences))
+            words, presences = in_words_that_fit(self, prompts, words)
         scores = torch.stack([word.scores for word in words])
         if given is not None:
             limits = torch.full((len(words),), given)
@@ -265,7 +266,7 @@ class Scene:
         camera = self.camera(view)
         if form_used(self.field, self.query) == "segment":
             return render_gaussian_scores(self.gaussians, camera, self.ask(prompts).scores)
-        return render_relevancy(self.field, self.gaussians, camera, self.question(prompts))
+        return render_relevancy(self.field, self.gaussians, camera, self.question(self.ask(prompts).asked))
 
     def scores(self, prompts: str | Sequence[str]) -> Tensor:
         """Relevancy ``[P, N]`` of every Gaussian for the prompts, in 0..1."""

@@ -137,6 +137,8 @@ def sentence(answer: Mapping[str, Any]) -> str:
     understood = worded(answer["understood"])
     if answer["present"] == "no":
         text = f"Not here: nothing fits {understood}."
+    elif not answer["instances"] and answer["present"] == "unsure":
+        text = f"Unsure: nothing certain is found for {understood}."
     elif not answer["instances"]:
         text = f"None found for {understood}."  # the note says why
     else:

@@ -47,6 +47,7 @@ class Word:
         selection: The selection of that threshold; None until it is asked for.
         note: A remark on how it is answered; "" if there is none.
         members: The objects that are the answer, where objects are; each is an instance.
+        asked: The words that are asked for in place of the prompt; "" where it is asked for itself.
     """
 
     scores: Tensor
@@ -56,6 +57,7 @@ class Word:
     selection: Selection | None = None
     note: str = ""
     members: tuple[Selection, ...] = ()
+    asked: str = ""
 
 
 def with_objects(scene: Scene, prompt: str, word: Word) -> Word:

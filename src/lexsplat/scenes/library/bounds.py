@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.queries.everyday import OFFSET
-from lexsplat.queries.phrases import Anything, Both, Except, Phrase, Thing, Viewer, parts_of
+from lexsplat.queries.meaning import compounds, known_words
+from lexsplat.queries.phrases import Anything, AtLeast, Both, Except, Phrase, Thing, Viewer, parts_of
 from lexsplat.queries.presence import NO_PART, NO_SEGMENT
 from lexsplat.queries.vocabulary import thing_of_part
 from lexsplat.runtime.device import one_thread
@@ -85,9 +86,10 @@ def phrase_bound(phrase: Phrase, of_thing: Mapping[str, FloatArray]) -> FloatArr
     A relation holds where all of its parts are present, a union where one is.
     """
     if isinstance(phrase, Thing):
-        # A part may be held from `NO_PART`.
-        return (NO_SEGMENT / NO_PART if thing_of_part(phrase.text) else 1.0) * of_thing[phrase.text]
-    if isinstance(phrase, (Anything, Viewer)):
+        # A part may be held from `NO_PART`, a lampshade as a lamp shade.
+        words = (phrase.text, *(split for split, _ in compounds(phrase.text, known_words(""))))
+        return (NO_SEGMENT / NO_PART if any(map(thing_of_part, words)) else 1.0) * of_thing[phrase.text]
+    if isinstance(phrase, (Anything, Viewer)) or (isinstance(phrase, AtLeast) and phrase.count == 0):
         return CERTAIN
     parts = [phrase_bound(part, of_thing) for part in parts_of(phrase).values()]
     if isinstance(phrase, Except):

@@ -150,6 +150,7 @@ class Found:
         skipped: Scenes that could not be asked, and why.
         rebuilt: Scenes that were built again since they were added, and what to do.
         encoders: Names of the encoders of the scenes, one for each encoder.
+        unread: Whether the phrase was not understood, so that nothing is certain.
     """
 
     phrase: str
@@ -162,13 +163,14 @@ class Found:
     skipped: dict[str, str]
     rebuilt: dict[str, str] = field(default_factory=dict)
     encoders: tuple[str, ...] = ()
+    unread: bool = False
 
     @property
     def present(self) -> Presence:
-        """Whether a scene holds it; "no" only if each scene was asked or ruled out, otherwise "unsure"."""
+        """Whether a scene holds it; "no" only if it was understood and each scene was asked or ruled out."""
         if self.hits:
             return self.hits[0].present
-        return "unsure" if self.unopened or self.skipped else "no"
+        return "unsure" if self.unopened or self.skipped or self.unread else "no"
 
     def __repr__(self) -> str:
         more = f"; {self.unopened} more may hold it" if self.unopened else ""

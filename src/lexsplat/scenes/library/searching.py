@@ -15,7 +15,8 @@ from torch import Tensor
 from lexsplat.queries.colors import without_color
 from lexsplat.queries.grammar import thing_of, understand
 from lexsplat.queries.kinds import is_of_kind, unknown_note, words_of_things
-from lexsplat.queries.phrases import Phrase, Thing, Understood, things_of, with_things
+from lexsplat.queries.meaning import compounds, known_words
+from lexsplat.queries.phrases import Phrase, Thing, Understood, own_words_of, things_of, with_things
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import PRESENCES
 from lexsplat.queries.spelling import corrected, spellings
@@ -67,7 +68,7 @@ def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> 
             opened += 1
             continue
         opened += hit.source == "scene"
-        if hit.present != "no":
+        if hit.present == "yes" or (hit.present == "unsure" and hit.count):
             hits.append(hit)
     hits.sort(key=lambda hit: (-PRESENCES.index(hit.present), -hit.bound, hit.scene))
     del hits[limit:]
@@ -84,6 +85,7 @@ def search(library: Library, phrase: str, limit: int, confirm: bool = False) -> 
         skipped=skipped,
         rebuilt=possible.rebuilt,
         encoders=possible.encoders,
+        unread=asked_for.unread,
     )
 
 
@@ -205,7 +207,10 @@ class _Asking:
         if record.group not in self._texts:
             self._texts[record.group] = self.library.embed(record.encoder, record.clip, [thing.text])[0]
         contents = self.library.contents(record)
-        return answer_from(contents, codes.units, thing, self.text, self._texts[record.group].cpu())
+        found = answer_from(contents, codes.units, thing, self.text, self._texts[record.group].cpu())
+        # The scene may hold it by its own words, a plural, or as two words.
+        otherwise = thing.own or any(compounds(thing.text, known_words(record.clip)))
+        return None if found and found.answer["present"] == "no" and otherwise else found
 
 
 @dataclass(frozen=True)
@@ -309,9 +314,12 @@ def spellings_of(phrase: Phrase, clip: str) -> dict[str, tuple[str, ...]]:
 
     A thing may have a color that language does not find, so it is also compared without its color.
     """
-    found = {}
+    found, own = {}, own_words_of(phrase)
     for text in things_of(phrase):
-        meant = (text, without_color(text), *spellings(text, words_of_things(clip)))
+        typed = own.get(text, text)
+        split = (words for words, _ in compounds(text, known_words(clip)))
+        meant = (text, without_color(text), typed, without_color(typed), *split)
+        meant = (*meant, *spellings(text, words_of_things(clip)))
         members = (name for name in default_vocabulary(clip) if any(is_of_kind(name, one) for one in meant))
         found[text] = tuple(dict.fromkeys((*meant, *members)))
     return found
