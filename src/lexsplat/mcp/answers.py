@@ -48,6 +48,7 @@ class Instance(TypedDict):
     score: Annotated[float, Field(ge=0, le=1, description="Mean relevancy.")]
     center: Vector
     size: Vector
+    center_meters: NotRequired[list[float]]
     size_meters: NotRequired[list[float]]
     axes: list[Vector]
     best_view: View
