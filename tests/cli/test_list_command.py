@@ -99,7 +99,7 @@ def test_a_table_is_alone_on_standard_output_and_the_rest_is_told_beside_it(tmp_
     scene, sheet = str(shutil.copytree(old, tmp_path / "scene")), str(tmp_path / "sheet.png")
     assert cli.main(["list", scene, "--csv", "--images", "--output", sheet]) == 0
     found = capsys.readouterr()
-    assert {len(row) for row in csv.reader(io.StringIO(found.out))} == {14}
+    assert {len(row) for row in csv.reader(io.StringIO(found.out))} == {17}
     assert found.err.splitlines()[-2:] == ["no segments: each word is looked for; how to get them", sheet]
 
 

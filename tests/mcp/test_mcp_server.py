@@ -63,7 +63,9 @@ def test_the_tools_are_described_and_read_only(server):
         assert tool.output_schema["required"]
 
 
-@pytest.mark.parametrize(("tool", "command"), [("find", "find"), ("list_objects", "list")])
+@pytest.mark.parametrize(
+    ("tool", "command"), [("find", "find"), ("list_objects", "list"), ("measure", "measure")]
+)
 def test_the_output_schema_of_a_tool_has_the_keys_of_the_command(server, tool, command):
     tools = {each.name: each for each in talk(server, lambda client: client.list_tools()).tools}
     assert _keys(tools[tool].output_schema) == _keys(read_json(SCHEMAS / f"{command}.json"))

@@ -1,4 +1,4 @@
-"""Words of the dictionary: that of simplemma, without reading it where everybody knows them, kept sorted, and singulars."""
+"""Words of the dictionary: as simplemma has them, kept sorted, not read where everybody knows them; and singulars."""
 
 import random
 

@@ -23,8 +23,8 @@ class Find:
 
     Ask in your own words: "mug on the cloth", "what is between the mug and the books?", "largest toy", "two apples",
     "which fruit is closest to me?" (docs/selection.md). What was understood is printed with the answer. Quotation
-    marks inside the phrase keep words together. Positions are in the units of the scene; sizes
-    are in meters once the scale is known (see lexsplat scale).
+    marks inside the phrase keep words together. Positions and sizes are in meters once the
+    scale is known (see lexsplat scale), and in units of the scene until then; --json has both.
 
     Args:
         scene: A scene folder, or the word "demo" for the bundled scene.
@@ -64,6 +64,7 @@ class Find:
 
 
 def _print_answer(answer: dict[str, Any]) -> None:
+    from lexsplat.queries.places import extent, position
     from lexsplat.scenes.serving import seen_in, shortened, worded
 
     understood = f" (understood as {worded(answer['understood'])})"
@@ -71,12 +72,7 @@ def _print_answer(answer: dict[str, Any]) -> None:
     phrase = shortened(answer["phrase"], 60)
     print(f"{phrase}: present: {answer['present']}, {answer['count']} found{understood}{note}")
     for number, thing in enumerate(answer["instances"], start=1):
-        center = ", ".join(f"{v:.2f}" for v in thing["center"])
-        size = " x ".join(f"{v:.2f}" for v in thing["size"])
-        unit = ""
-        if thing.get("size_meters") is not None:
-            size, unit = " x ".join(f"{v:.3f}" for v in thing["size_meters"]) + " m", " scene units"
         print(
-            f"  {number}. {shortened(thing['name'], 60)} at ({center}){unit}, size {size}, "
+            f"  {number}. {shortened(thing['name'], 60)} at {position(thing)}, size {extent(thing)}, "
             f"score {thing['score']:.2f}, {thing['gaussians']} Gaussians, {seen_in(thing)}"
         )

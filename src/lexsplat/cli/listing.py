@@ -17,7 +17,8 @@ class List:
     """List everything in a scene: names, colors, places and sizes of its objects.
 
     Objects come from the segments that a build stores with the language. Names come from a vocabulary: a text file
-    with one name a line, such as "teapot". Sizes are in meters once the scale is known (see lexsplat scale).
+    with one name a line, such as "teapot". Positions and sizes are in meters once the scale is known
+    (see lexsplat scale), and in units of the scene until then; --json and --csv have both.
 
     Args:
         scene: A scene folder, or the word "demo" for the bundled scene.
@@ -75,17 +76,14 @@ class List:
 
 
 def _print_objects(document: dict[str, Any]) -> None:
+    from lexsplat.queries.places import extent, position
     from lexsplat.scenes.serving import seen_in
 
     for number, thing in enumerate(document["objects"], start=1):
-        center = ", ".join(f"{value:.2f}" for value in thing["center"])
-        size = " x ".join(f"{value:.2f}" for value in thing["size"])
-        if "size_meters" in thing:
-            size = " x ".join(f"{value:.3f}" for value in thing["size_meters"]) + " m"
         names = ", ".join(f"{each['name']} {each['probability']:.2f}" for each in thing["names"])
         print(
-            f"{number}. {names}; {' and '.join(thing['colors'])}; at ({center}), size {size}, "
-            f"{thing['gaussians']} Gaussians, {seen_in(thing)}"
+            f"{number}. {names}; {' and '.join(thing['colors'])}; at {position(thing)}, "
+            f"size {extent(thing)}, {thing['gaussians']} Gaussians, {seen_in(thing)}"
         )
     print(f"{len(document['objects'])} objects, named with {document['words']} words")
     for line in filter(None, (document["note"], document["picture"])):
@@ -93,7 +91,7 @@ def _print_objects(document: dict[str, Any]) -> None:
 
 
 def _print_table(things: list[dict[str, Any]]) -> None:
-    columns = ("center", "size", "size_meters")
+    columns = ("center", "size", "size_meters", "center_meters")
     writer = csv.writer(sys.stdout, lineterminator="\n")
     places = [f"{column}_{axis}" for column in columns for axis in "xyz"]
     writer.writerow(["name", "probability", "colors", *places, "gaussians", "best_view"])

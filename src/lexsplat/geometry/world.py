@@ -21,7 +21,7 @@ import numpy as np
 
 from lexsplat.geometry.boxes import Up, gravity_up
 from lexsplat.geometry.cameras import Camera
-from lexsplat.runtime.errors import SceneFolderError
+from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.runtime.fingerprints import digest
 
 Source = Literal["cameras", "splats", "user"]
@@ -70,6 +70,21 @@ class World:
     def meters(self, length: float) -> float | None:
         """A length in world units, in meters; None if the scale is unknown."""
         return None if self.meters_per_unit is None else float(length) * self.meters_per_unit
+
+    def units(self, meters: float) -> float:
+        """A length in meters, in world units.
+
+        Raises:
+            QueryError: If the scale is unknown.
+        """
+        if self.meters_per_unit is None:
+            raise QueryError(
+                f"{meters:g} m",
+                expected="a scene with a known scale",
+                found="none",
+                remedy="set it with: lexsplat scale; or give the length in scene units",
+            )
+        return meters / self.meters_per_unit
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for ``scene.json`` and for JSON output."""

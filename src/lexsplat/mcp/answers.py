@@ -10,8 +10,6 @@ from typing import Annotated, Literal
 from pydantic import Field
 from typing_extensions import NotRequired, TypedDict
 
-from lexsplat.queries.selection import Selection
-
 Present = Annotated[
     Literal["yes", "unsure", "no"],
     Field(description='"no": the scene does not hold it, and nothing is listed.'),
@@ -48,6 +46,7 @@ class Instance(TypedDict):
     score: Annotated[float, Field(ge=0, le=1, description="Mean relevancy.")]
     center: Vector
     size: Vector
+    center_meters: NotRequired[list[float]]
     size_meters: NotRequired[list[float]]
     axes: list[Vector]
     best_view: View
@@ -61,15 +60,6 @@ class Certainty(TypedDict):
         float, Field(description="Relevancy from which a Gaussian matches; of two phrases, the lower one.")
     ]
     best_view: View
-
-
-def certainty(found: Selection) -> Certainty:
-    """The facts of a selection, as `Selection.to_dict` has them."""
-    return {
-        "present": found.present,
-        "threshold": round(float(found.threshold), 4),
-        "best_view": found.best_view if found and found.present != "no" else "",
-    }
 
 
 class Asked(Certainty):

@@ -11,10 +11,10 @@ import torch
 from PIL import Image, ImageDraw
 
 from lexsplat.geometry.cameras import Camera
-from lexsplat.mcp.answers import certainty
 from lexsplat.queries.heatmaps import overlay_heatmap
 from lexsplat.queries.phrases import Thing
 from lexsplat.queries.scoring import render_gaussian_scores
+from lexsplat.scenes.asked import certainty
 from lexsplat.scenes.scene import Scene
 
 _WIDTH = 640

@@ -39,9 +39,9 @@ RESOURCES = ("lexsplat://scenes", "lexsplat://scene/{name}", "lexsplat://scene/{
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 INSTRUCTIONS = (
-    "Places that can be searched with words. Positions are in scene units, in the axes of the scene; meters are "
-    'given where the scale is known. "present": "no" means that the scene does not hold it: say so, do not guess. '
-    '"understood" is how a phrase was parsed.'
+    'Places that can be searched with words. Positions are in the axes of the scene: "center" in scene units, '
+    '"center_meters" and sentences in meters where the scale is known. "present": "no" means that the scene does '
+    'not hold it: say so, do not guess. "understood" is how a phrase was parsed.'
 )
 
 

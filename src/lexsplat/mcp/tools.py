@@ -13,16 +13,18 @@ from pydantic import Field
 
 from lexsplat.mcp import answers
 from lexsplat.mcp.arguments import NOT_BLANK, nearest
-from lexsplat.mcp.pairs import called, different, measured, others, view_of
 from lexsplat.mcp.pictures import picture
 from lexsplat.queries.patterns import VIEWER
 from lexsplat.queries.phrases import Related, RelationName, Understood, Viewer
-from lexsplat.queries.selection import PRESENCES, Selection
+from lexsplat.queries.places import UNITS
 from lexsplat.runtime.errors import LexsplatError, QueryError
 from lexsplat.scenes.answers import find_phrases
+from lexsplat.scenes.asked import both, certainty, joined, things_of
 from lexsplat.scenes.finding import find_in
 from lexsplat.scenes.library import Library
+from lexsplat.scenes.measuring import in_words, length_of, measure, measured_sentence
 from lexsplat.scenes.objects import list_document
+from lexsplat.scenes.pairs import called, different, others, view_of
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.serving import MAX_LINE, OpenScene, counted, placed, qualified, sentence, shortened
 from lexsplat.scenes.unsaved import unsaved_steps
@@ -148,9 +150,9 @@ class Tools:
         """Tell whether things stand in a relation to others, and which do. Left and right are those of the view."""
         place = self._scene(scene)
         viewer = VIEWER.match(second.strip())
-        both = place.understand(first), Understood(Viewer()) if viewer else place.understand(second)
-        related = Related(relation, both[0].phrase, both[1].phrase)
-        unknown, unread = (any(getattr(each, name) for each in both) for name in ("unknown", "unread"))
+        pair = place.understand(first), Understood(Viewer()) if viewer else place.understand(second)
+        related = Related(relation, pair[0].phrase, pair[1].phrase)
+        unknown, unread = (any(getattr(each, name) for each in pair) for name in ("unknown", "unread"))
         asked = Understood(related, "", unknown, unread)
         found = find_in(place, asked, place.camera(view) if view else None, None)
         holds = {"yes": "Yes", "unsure": "Perhaps", "no": "No"}[found.present]
@@ -158,7 +160,7 @@ class Tools:
             **place.world.to_json(),
             **found.to_dict(),
             "understood": str(related),
-            "note": _joined(both[0].note, both[1].note, found.note),
+            "note": joined(pair[0].note, pair[1].note, found.note),
             "holds": holds.lower(),
             "seen_from": found.seen_from or None,
         }
@@ -187,7 +189,7 @@ class Tools:
         """Find which of several things is nearest to another thing or to a point, and how far away it is."""
         _one_of({"to": to.strip(), "point": point})
         place = self._scene(scene)
-        things, asked = _found(place, target)
+        things, asked = things_of(place, target)
         understood = shortened(asked["understood"])
         if point:
             goal = np.array(point, dtype=float)
@@ -196,27 +198,27 @@ class Tools:
                 raise QueryError("point", expected=expected, found=repr(point)[:60])
             best = min(things, key=lambda one: float(np.linalg.norm(one.center - goal)))
             gap = float(np.linalg.norm(best.center - goal))
-            where, end, candidates = f"({', '.join(f'{value:.2f}' for value in point)})", None, things
+            where, end, candidates = f"({', '.join(f'{value:.2f}' for value in point)}) {UNITS}", None, things
         else:
-            ends, reference = _found(place, to)
+            ends, reference = things_of(place, to)
             candidates = others(things, ends) or things
             gap, best, end = different(candidates, ends, target[:60])
-            asked = _both(asked, reference, "nearest to", view_of(best, end))
+            asked = both(asked, reference, "nearest to", view_of(best, end))
             where = called(end, ends)
             if len(ends) > 1:
                 fits = f"{shortened(reference['understood'])} fits {len(ends)} things"
-                asked["note"] = _joined(asked["note"], f"{fits}; taken is the nearest one, {where}")
+                asked["note"] = joined(asked["note"], f"{fits}; taken is the nearest one, {where}")
         document = {
             **place.world.to_json(),
             **asked,
-            "distance": _lengths(place, gap),
+            "distance": length_of(place.world, gap),
             "nearest": best.geometry(),
             "to": end.geometry() if end else None,
             "among": len(candidates),
         }
         only = f"the only {'other ' if len(things) > 1 else ''}one for {understood}"
         among = only if len(candidates) == 1 else f"of {len(candidates)} for {understood}"
-        text = f"{called(best, things)} is nearest to {where}: {_length(place, gap)} away, {among}."
+        text = f"{called(best, things)} is nearest to {where}: {in_words(length_of(place.world, gap))} away, {among}."
         return Reply(qualified(text, asked), document)
 
     def measure(
@@ -224,26 +226,8 @@ class Tools:
     ) -> Annotated[Reply, answers.MeasureAnswer]:
         """Measure between two things: center to center, the gap between their surfaces, the difference in height."""
         place = self._scene(scene)
-        (ones, first_asked), (ends, also) = _found(place, first), _found(place, second)
-        gap, one, other = different(ones, ends, f"{first[:60]} and {second[:60]}")
-        asked = _both(first_asked, also, "and", view_of(one, other))
-        asked["note"] = _joined(asked["note"], measured((one, ones, first_asked), (other, ends, also)))
-        offset = other.center - one.center
-        rise = float(offset @ np.asarray(one.up.direction))
-        lengths = {"centers": float(np.linalg.norm(offset)), "gap": gap, "height": rise}
-        document = {
-            **place.world.to_json(),
-            **asked,
-            "first": one.geometry(),
-            "second": other.geometry(),
-            **{name: _lengths(place, value) for name, value in lengths.items()},
-        }
-        text = (
-            f"{shortened(asked['understood'])}: {_length(place, lengths['centers'])} between their centers, "
-            f"{_length(place, lengths['gap'])} between their surfaces; the second is {_length(place, abs(rise))} "
-            f"{'higher' if rise >= 0 else 'lower'}."
-        )
-        return Reply(qualified(text, asked), document)
+        document = measure(place, first, second)
+        return Reply(measured_sentence(document), document)
 
     def what_is_at(
         self,
@@ -264,7 +248,7 @@ class Tools:
         shown = best if name else hit
         document = {
             **place.world.to_json(),
-            **answers.certainty(shown),
+            **certainty(shown),
             "name": name,
             "view": view,
             "x": x,
@@ -298,7 +282,7 @@ class Tools:
         name = place.view(view).name if view else ""
         looked_at = None
         if look_at:
-            (best, *_), looked_at = _found(place, look_at)
+            (best, *_), looked_at = things_of(place, look_at)
             name = best.best_view
         name = name or next(iter(place.views))
         legend, png = picture(place, name, phrases)
@@ -391,55 +375,3 @@ def _remark(facts: Mapping[str, Any]) -> str:
     if "problem" in facts:
         return f" ({facts['problem']})"
     return f" ({counted(facts['unsaved_steps'], 'unsaved step')})" if facts["unsaved_steps"] else ""
-
-
-def _found(scene: Scene, phrase: str) -> tuple[list[Selection], dict[str, Any]]:
-    """The instances of a phrase, the best first, and how it was understood (`answers.Asked`).
-
-    Raises:
-        QueryError: If the scene does not hold it.
-    """
-    found, asked = asked_of(scene, phrase)
-    return sorted(found.instances, key=lambda one: -one.score), asked
-
-
-def asked_of(scene: Scene, phrase: str) -> tuple[Selection, dict[str, Any]]:
-    """The selection of a phrase, and how the phrase was understood (`answers.Asked`).
-
-    Raises:
-        QueryError: If the scene does not hold it.
-    """
-    understood, found = scene.understand(phrase), scene.find(phrase)
-    if found.present == "no" or not found:
-        note = f" ({found.note})" if found.note else ""
-        raise QueryError(
-            phrase[:60],
-            expected="something that the scene holds",
-            found=f"not here: nothing fits {shortened(str(understood.phrase))}{note}",
-        )
-    return found, {"understood": str(understood.phrase), "note": found.note, **answers.certainty(found)}
-
-
-def _joined(*notes: str) -> str:
-    return "; ".join(dict.fromkeys(filter(None, notes)))
-
-
-def _both(first: dict[str, Any], second: dict[str, Any], link: str, view: str) -> dict[str, Any]:
-    """How two phrases were understood; together they are as present as the less certain one."""
-    return {
-        "understood": f"{first['understood']} {link} {second['understood']}",
-        "note": _joined(first["note"], second["note"]),
-        "present": min(first["present"], second["present"], key=PRESENCES.index),
-        "threshold": min(first["threshold"], second["threshold"]),
-        "best_view": view,
-    }
-
-
-def _lengths(scene: Scene, value: float) -> dict[str, float | None]:
-    unit = scene.world.meters_per_unit
-    return {"units": round(value, 5), "meters": None if unit is None else round(value * unit, 5)}
-
-
-def _length(scene: Scene, value: float) -> str:
-    unit = scene.world.meters_per_unit
-    return f"{value:.3g} scene units" if unit is None else f"{value * unit:.3g} m"

@@ -14,8 +14,9 @@ from anyio import from_thread
 from pydantic import Field
 
 from lexsplat.mcp import answers
-from lexsplat.mcp.tools import PhraseText, Reply, SceneName, Tools, asked_of
+from lexsplat.mcp.tools import PhraseText, Reply, SceneName, Tools
 from lexsplat.runtime.errors import QueryError, SceneFolderError
+from lexsplat.scenes.asked import asked_of
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.exporting import ending_of, export_scene, exported
 from lexsplat.scenes.library import Library

@@ -25,6 +25,7 @@ from lexsplat.geometry.rotations import matrices_from_quaternions
 from lexsplat.geometry.world import World
 from lexsplat.queries.best_views import promising_views, visible_share
 from lexsplat.queries.clusters import LINK, clusters, spacing
+from lexsplat.queries.places import given_length, place_of
 from lexsplat.queries.touching import divided
 from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.lazy import at_first_call
@@ -170,11 +171,17 @@ class Selection:
     @property
     def size_meters(self) -> NDArray[np.float64] | None:
         """`size` in meters; None if the scale of the scene is unknown (``lexsplat scale``)."""
-        scale = self.world.meters_per_unit if self.world else None
-        return None if scale is None else self.size * scale
+        return self._in_meters(self.size)
+
+    @property
+    def center_meters(self) -> NDArray[np.float64] | None:
+        """`center` in meters, in the axes of the scene and from its origin; None if the scale is unknown."""
+        return self._in_meters(self.center)
 
     def distance_to(self, other: Selection) -> float:
         """Distance between the centers of the boxes of two selections of one scene, world units.
+
+        In meters it is `distance_meters_to`.
 
         Raises:
             QueryError: If one is empty.
@@ -184,6 +191,11 @@ class Selection:
             raise TypeError(f"expected a Selection, got {other!r}"[:200])
         self._check_scene(other)
         return float(np.linalg.norm(self.center - other.center))
+
+    def distance_meters_to(self, other: Selection) -> float | None:
+        """`distance_to` in meters; None if the scale of the scene is unknown."""
+        distance = self.distance_to(other)
+        return self.world.meters(distance) if self.world else None
 
     @cached_property
     def instances(self) -> list[Selection]:
@@ -220,6 +232,11 @@ class Selection:
         shares = [(name, visible_share(self, self.cameras[name])) for name in promising_views(self)]
         return sorted(shares, key=lambda entry: -entry[1])
 
+    @property
+    def shown_in(self) -> str:
+        """`best_view`, or "" if not even that shows it."""
+        return self.best_view if self.view_shares and self.view_shares[0][1] > 0 else ""
+
     def is_of(self, gaussians: Gaussians) -> bool:
         """Whether it was made in a scene of these Gaussians, in any colors."""
         own, others = self.gaussians.means, gaussians.means
@@ -240,25 +257,29 @@ class Selection:
         phrase = f"not {self.phrase}".strip()
         return replace(self, mask=~self.mask, parts=(), scores=1 - self.scores, phrase=phrase)
 
-    def grow(self, distance: float | None = None) -> Selection:
-        """The union with the Gaussians within ``distance`` (world units; None derives it from the spacing).
+    def grow(self, distance: float | None = None, *, meters: float | None = None) -> Selection:
+        """The union with the Gaussians within a distance.
+
+        Args:
+            distance: In world units; None derives it from the spacing of the Gaussians.
+            meters: In meters, in place of ``distance``.
 
         Raises:
-            QueryError: If the distance is negative or no number.
+            QueryError: If the distance is negative or no number, given in both ways, or in meters without a scale.
         """
         if not self:
             return self
-        reach = self._reach(distance)
+        reach = self._reach(distance, meters)
         tree = cKDTree(self._means()[self.mask.cpu().numpy()])
         apart, _ = tree.query(self._means(), distance_upper_bound=reach)
         return replace(self, mask=self.mask | self._tensor(np.isfinite(apart)), parts=())
 
-    def shrink(self, distance: float | None = None) -> Selection:
-        """The Gaussians that are farther than ``distance`` from every Gaussian outside the selection."""
+    def shrink(self, distance: float | None = None, *, meters: float | None = None) -> Selection:
+        """The Gaussians farther than a distance from each one outside the selection; arguments as of `grow`."""
         outside = (~self.mask & (self.gaussians.opacities >= FAINT)).cpu().numpy()
         if not self or not outside.any():
             return self
-        reach = self._reach(distance)
+        reach = self._reach(distance, meters)
         apart, _ = cKDTree(self._means()[outside]).query(self._means(), distance_upper_bound=reach)
         mask = self.mask & ~self._tensor(np.isfinite(apart))
         return replace(self, mask=mask, present=self.present if bool(mask.any()) else "no")
@@ -316,7 +337,7 @@ class Selection:
             "count": len(instances),
             "gaussians": self.num_gaussians,
             "threshold": round(float(self.threshold), 4),
-            "best_view": self._shown_in if instances else "",
+            "best_view": self.shown_in if instances else "",
             "note": self.note,
             "instances": [instance.geometry() for instance in instances],
         }
@@ -327,25 +348,9 @@ class Selection:
         Raises:
             QueryError: If nothing is selected.
         """
-        box, meters = self.box, self.size_meters
-        known = {} if meters is None else {"size_meters": [round(float(v), 5) for v in meters]}
-        return {
-            "name": self.phrase,
-            "gaussians": self.num_gaussians,
-            "score": round(self.score, 4),
-            "center": [round(float(v), 5) for v in box.center],
-            "size": [round(float(v), 5) for v in 2 * box.half_sizes],
-            **known,
-            "axes": [[round(float(v), 5) for v in axis] for axis in box.axes],
-            "best_view": self._shown_in,
-        }
+        return place_of(self)
 
     # -- inside
-
-    @property
-    def _shown_in(self) -> str:
-        """`best_view`, or "" if not even that shows it."""
-        return self.best_view if self.view_shares and self.view_shares[0][1] > 0 else ""
 
     @cached_property
     def sample(self) -> NDArray[np.float64]:
@@ -408,12 +413,13 @@ class Selection:
         )
         return means.cpu().double().numpy(), logits.sigmoid().cpu().double().numpy()
 
-    def _reach(self, distance: float | None) -> float:
-        if distance is not None:
-            if isinstance(distance, str) or not hasattr(distance, "__float__") or not float(distance) >= 0:
-                raise QueryError("distance", expected="a number from 0", found=repr(distance)[:40])
-            return float(np.nextafter(float(distance), np.inf))
-        return self._spacing() * LINK
+    def _in_meters(self, lengths: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        scale = self.world.meters_per_unit if self.world else None
+        return None if scale is None else lengths * scale
+
+    def _reach(self, distance: float | None, meters: float | None = None) -> float:
+        given = given_length(self.world, distance, meters)
+        return self._spacing() * LINK if given is None else float(np.nextafter(given, np.inf))
 
     def _spacing(self) -> float:
         """Median distance from a selected Gaussian to its sixth neighbor."""

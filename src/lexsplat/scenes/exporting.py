@@ -163,7 +163,7 @@ def export_scene(
                 names = [selection.phrase for selection in found]
                 write_labels_csv(scene.gaussians, labels, scores, names, temporary)
             else:
-                write_json(temporary, labels_as_json(found))
+                write_json(temporary, {**scene.world.to_json(), **labels_as_json(found)})
         return [path]
     stored = stored_language(scene.field, scene.encoder_identity()) if language else None
     gaussians = scene.gaussians

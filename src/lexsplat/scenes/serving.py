@@ -13,6 +13,7 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+from lexsplat.queries.places import position
 from lexsplat.queries.spelling import corrected
 from lexsplat.runtime.errors import LexsplatError, QueryError, SceneFolderError
 from lexsplat.runtime.progress import Listener, silent, uncounted
@@ -156,9 +157,8 @@ def qualified(text: str, answer: Mapping[str, Any]) -> str:
 
 
 def placed(thing: Mapping[str, Any], link: str = " at ") -> str:
-    """A thing (`Selection.geometry`) with its place and best view, for a sentence; places are in scene units."""
-    center = ", ".join(f"{value:.2f}" for value in thing["center"])
-    return f"{shortened(thing['name'], 60)}{link}({center}) scene units, {seen_in(thing)}"
+    """A thing (`Selection.geometry`) with its place and best view, for a sentence."""
+    return f"{shortened(thing['name'], 60)}{link}{position(thing)}, {seen_in(thing)}"
 
 
 def seen_in(thing: Mapping[str, Any]) -> str:

@@ -33,6 +33,7 @@ from lexsplat.queries.everyday import EverydayScale
 from lexsplat.queries.grammar import understand
 from lexsplat.queries.kinds import is_kind, is_of_kind, words_of_things
 from lexsplat.queries.phrases import Thing
+from lexsplat.queries.places import lengths
 from lexsplat.queries.presence import FAINT, DescribedPlaces, PresenceClassifier
 from lexsplat.queries.segments import SEGMENT_THRESHOLD, segment_relevancy
 from lexsplat.queries.selection import PEAK_COUNT, SMALLEST_SHARE, Presence, Selection
@@ -329,5 +330,5 @@ def with_world(indexed: Indexed, stored: Any) -> tuple[Indexed, World] | None:
     if world.meters_per_unit is None:
         return indexed, world
     for each in indexed.answer["instances"]:
-        each["size_meters"] = [round(v * world.meters_per_unit, 5) for v in each["size"]]
+        each.update(lengths(each["center"], each["size"], world.meters_per_unit))
     return indexed, world

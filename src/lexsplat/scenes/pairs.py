@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lexsplat.queries.places import lengths_of, position
 from lexsplat.queries.relations import distance, same
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import QueryError
@@ -75,7 +76,7 @@ def called(one: Selection, among: Sequence[Selection]) -> str:
     """Name of a thing, with its place if another thing has the same name."""
     if sum(each.phrase == one.phrase for each in among) < 2:
         return one.phrase
-    return f"{one.phrase} at ({', '.join(f'{value:.2f}' for value in one.center)})"
+    return f"{one.phrase} at {position(lengths_of(one))}"
 
 
 def view_of(first: Selection, second: Selection) -> str:

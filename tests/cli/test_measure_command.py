@@ -1,0 +1,80 @@
+"""``lexsplat measure``: lengths between two things of the bundled scene, compared with their boxes and points."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from support.command_line import fails_in_one_line
+from support.schemas import validated
+
+from lexsplat import cli, open_scene
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
+from lexsplat.scenes.scale import store_world
+
+METERS = 0.25
+"""Meters in a unit of the copy."""
+
+
+@pytest.fixture(scope="module")
+def scaled(tmp_path_factory) -> str:
+    folder = shutil.copytree(BUNDLED_SCENE, tmp_path_factory.mktemp("known") / "scene")
+    store_world(SceneFolder.open(folder), meters_per_unit=METERS)
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def things():
+    scene = open_scene("demo", device="cpu")
+    return [scene.find(phrase) for phrase in ("mug", "banana")]
+
+
+def printed(capsys, *arguments: str) -> str:
+    capsys.readouterr()
+    assert cli.main(["measure", *arguments]) == 0
+    return capsys.readouterr().out
+
+
+def test_lengths_are_those_of_the_boxes_and_the_points(things, scaled, capsys):
+    mug, banana = things
+    points, others = (thing.selected.means.detach().double().numpy() for thing in things)
+    expected = {
+        "centers": np.linalg.norm(mug.center - banana.center),
+        "gap": min(np.sqrt(((others - point) ** 2).sum(1)).min() for point in points),
+        "height": banana.center[2] - mug.center[2],
+    }
+    unknown = json.loads(printed(capsys, "demo", "mug", "banana", "--json"))
+    validated("measure", unknown)
+    known = json.loads(printed(capsys, scaled, "mug", "banana", "--json"))
+    validated("measure", known)
+    for name, length in expected.items():
+        tolerance = 0.05 if name == "gap" else 1e-3  # the gap is between samples of the points
+        assert unknown[name]["units"] == known[name]["units"] == pytest.approx(length, abs=tolerance), name
+        assert unknown[name]["meters"] is None
+        assert known[name]["meters"] == pytest.approx(METERS * known[name]["units"], abs=1e-5), name
+
+
+def test_lengths_are_printed_in_scene_units_and_in_meters_where_they_are_known(things, scaled, capsys):
+    apart = float(np.linalg.norm(things[0].center - things[1].center))
+    out = printed(capsys, scaled, "mug", "banana")
+    assert f"between their centers: {METERS * apart:.3f} m ({apart:.3f} scene units)" in out
+    out = printed(capsys, "demo", "mug", "banana")
+    assert f"between their centers: {apart:.3f} scene units\n" in out
+    assert " m " not in out
+
+
+def test_of_several_things_the_nearest_pair_is_named(capsys):
+    out = printed(capsys, "demo", "apple", "fruit")
+    assert '"fruit" fits 2 things; measured is the nearest pair, apple and banana' in out
+
+
+@pytest.mark.parametrize(
+    ("phrases", "told"),
+    [
+        (["mug", "violin"], "violin: expected something that the scene holds, found not here"),
+        (["mug", "mug"], "mug and mug: expected two different things, found one thing alone"),
+        (["mug", ""], "word or phrase"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_in_one_line(capsys, phrases, told):
+    fails_in_one_line(capsys, ["measure", "demo", *phrases], told)
