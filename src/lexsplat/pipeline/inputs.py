@@ -26,7 +26,7 @@ from lexsplat.captures import (
     poses_from_photos,
 )
 from lexsplat.captures.ground_truth.layouts import annotated_names
-from lexsplat.captures.images.reading import IMAGE_SUFFIXES
+from lexsplat.captures.images.reading import IMAGE_SUFFIXES, transparency_of
 from lexsplat.captures.loading import check_capture
 from lexsplat.captures.readers.video import is_video, require_video, sample_video
 from lexsplat.captures.sfm.preparation import (
@@ -297,8 +297,11 @@ def _photos_fingerprint(source: Path, photos: Path, output: Path, config: BuildC
             raise CaptureError(source, expected="a video", found="no such file", remedy="check the path")
         return fingerprint(settings, source.name, file_sample(source), config.frames)
     masks = [path for folder in mask_places(photos) for path in sorted(folder.rglob("*")) if path.is_file()]
-    paths = [*(photos / name for name in find_photos(photos, output)), *masks]
-    return fingerprint(settings, [[os.path.relpath(path, photos), file_sample(path)] for path in paths])
+    found = [photos / name for name in find_photos(photos, output)]
+    files = [[os.path.relpath(path, photos), file_sample(path)] for path in (*found, *masks)]
+    # Poses that were made when transparent pixels were not ignored are made again.
+    transparent = [os.path.relpath(path, photos) for path in found if transparency_of(path).hides]
+    return fingerprint(settings, files, *filter(None, [transparent]))
 
 
 def reload_capture(folder: SceneFolder, source: Path | None = None) -> Capture:

@@ -33,9 +33,10 @@ def hash_capture(capture: Capture) -> tuple[dict[str, str], str]:
     """Hashes of the photos by view, and a fingerprint of photos, masks, cameras and split."""
     sources = {name: file_hash(view.image_path) for name, view in capture.views.items()}
     masks = {n: file_hash(v.ignore_path) for n, v in capture.views.items() if v.ignore_path is not None}
+    transparent = [name for name, view in capture.views.items() if view.ignores_transparent]
     splits = _cameras_with_split(capture).items()
     cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), split] for n, (c, split) in splits}
-    return sources, fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
+    return sources, fingerprint(sources, cameras, *filter(None, (masks, transparent)))
 
 
 def _cameras_with_split(capture: Capture) -> dict[str, tuple[Camera, str]]:

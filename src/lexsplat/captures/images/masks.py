@@ -42,9 +42,21 @@ def find_ignore_masks(folders: Sequence[Path], names: Iterable[str]) -> tuple[di
     strays = sorted(there - {path.relative_to(folder).as_posix() for path in found.values()})
     if not strays:
         return found, []
-    some = ", ".join(strays[:3]) + (" and more" if len(strays) > 3 else "")
     many = "1 mask matches" if len(strays) == 1 else f"{len(strays)} masks match"
-    return found, [f"{folder}: {many} no photo and {'is' if len(strays) == 1 else 'are'} ignored: {some}"]
+    return found, [
+        f"{folder}: {many} no photo and {'is' if len(strays) == 1 else 'are'} ignored: {some_of(strays)}"
+    ]
+
+
+def some_of(names: Sequence[str]) -> str:
+    """The first three names, in a line."""
+    return ", ".join(names[:3]) + (" and more" if len(names) > 3 else "")
+
+
+def transparency_note(folder: Path, names: Sequence[str]) -> str:
+    """The note that transparent pixels of these photos of a folder are ignored."""
+    many = "1 photo" if len(names) == 1 else f"{len(names):,} photos"
+    return f"{folder}: transparent pixels of {many} are ignored, as masked ones are: {some_of(names)}"
 
 
 def blank_masks(masks: Mapping[str, Path]) -> list[str]:

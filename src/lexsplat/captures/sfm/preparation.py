@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lexsplat.captures.capture import stem_of
-from lexsplat.captures.images.masks import IGNORE_FOLDER, find_ignore_masks
+from lexsplat.captures.images.masks import IGNORE_FOLDER, find_ignore_masks, some_of, transparency_note
 from lexsplat.captures.images.reading import (
     IMAGE_SUFFIXES,
+    PhotoRows,
+    Transparency,
     image_size,
     misfit,
     open_image,
@@ -29,6 +31,7 @@ from lexsplat.captures.images.reading import (
     read_mask,
     resize_nearest,
     sizes_agree,
+    transparency_of,
 )
 from lexsplat.captures.readers.camera_files import checked_name
 from lexsplat.captures.readers.video import videos_in
@@ -75,7 +78,7 @@ class PreparedPhotos:
 
 @dataclass(frozen=True)
 class _Photo:
-    """Header of a photo: its upright size, how it is stored, and its lens."""
+    """Header of a photo: its upright size, how it is stored, its lens, and whether pixels are transparent."""
 
     name: str
     size: tuple[int, int]
@@ -84,6 +87,7 @@ class _Photo:
     lossy: bool
     exif: Image.Exif
     focal: tuple[Any, ...]
+    transparency: Transparency
 
 
 def photo_folder(capture: Path) -> Path:
@@ -147,7 +151,9 @@ def prepare_photos(
     notes += strays
     images, renamed = folder, {name: name for name in names}
     unready = not all(photo.plain and photo.orientation == 1 for photo in photos)
-    if unready or found:
+    hidden = [photo.name for photo in photos if photo.transparency.hides]
+    masked = {*found, *hidden}
+    if unready or masked:
         _refuse_output_among_photos(folder, output)
     if unready:
         images = output / "images"
@@ -158,9 +164,11 @@ def prepare_photos(
         done = f"rotated upright: {turned}; converted to JPEG or PNG: {converted}"
         notes.append(f"copies of photos are in {images}: {done}")
     masks = None
-    if found:
-        masks = _write_masks(photos, found, renamed, output)
-        notes.append(f"{len(found)} of {len(names)} photos are masked")
+    if hidden:
+        notes.append(transparency_note(folder, hidden))
+    if masked:
+        masks = _write_masks(photos, folder, found, renamed, output)
+        notes.append(f"{len(masked)} of {len(names)} photos are masked")
     groups: dict[tuple[Any, ...], list[str]] = {}
     for photo in photos:
         groups.setdefault((photo.size, photo.focal), []).append(renamed[photo.name])
@@ -197,15 +205,11 @@ def _left_out(folder: Path) -> list[str]:
     notes = []
     if other:
         told = "is left out: its format is" if len(other) == 1 else "are left out: their formats are"
-        notes.append(f"{_some(other)} {told} not read; save as JPEG or PNG")
+        notes.append(f"{some_of(other)} {told} not read; save as JPEG or PNG")
     if videos := videos_in(folder):
         told = "is" if len(videos) == 1 else "are"
-        notes.append(f"{_some(videos)} {told} left out: a video is given by itself, without photos")
+        notes.append(f"{some_of(videos)} {told} left out: a video is given by itself, without photos")
     return notes
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (" and more" if len(names) > 3 else "")
 
 
 def _twins(names: Sequence[str]) -> list[str]:
@@ -295,7 +299,7 @@ def _look_at(folder: Path, name: str) -> _Photo:
     sensor = exif.get_ifd(_EXIF)
     focal = (exif.get(_MAKE), exif.get(_MODEL), *(str(sensor.get(tag)) for tag in _FOCAL))
     size = (height, width) if orientation >= 5 else (width, height)
-    return _Photo(name, size, orientation, plain, lossy, exif, focal)
+    return _Photo(name, size, orientation, plain, lossy, exif, focal, transparency_of(path))
 
 
 def turned_upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
@@ -367,15 +371,22 @@ def _write_upright(photo: _Photo, source: Path, target: Path) -> None:
 
 
 def _write_masks(
-    photos: Sequence[_Photo], found: dict[str, Path], renamed: dict[str, str], output: Path
+    photos: Sequence[_Photo], folder: Path, found: dict[str, Path], renamed: dict[str, str], output: Path
 ) -> Path:
-    """Write masks in COLMAP's layout: ``NAME.png``, black and white, upright, of the photo's size."""
+    """Write masks in COLMAP's layout: ``NAME.png``, black and white, upright, of the photo's size.
+
+    Black is what the photo's mask in ``found`` ignores, and what is transparent in the photo.
+    """
     place = output / IGNORE_FOLDER
     shutil.rmtree(place, ignore_errors=True)
     for photo in photos:
-        if photo.name not in found:
+        if photo.name not in found and not photo.transparency.hides:
             continue
-        mask = _fitted_mask(read_mask(found[photo.name], nonzero=True), photo, found[photo.name])
+        mask = np.ones(photo.size[::-1], bool)
+        if photo.name in found:
+            mask = _fitted_mask(read_mask(found[photo.name], nonzero=True), photo, found[photo.name])
+        if photo.transparency.hides:
+            mask = mask & turned_upright(PhotoRows(folder / photo.name).opaque(), photo.orientation)
         with atomic_path(place / f"{renamed[photo.name]}.png") as temporary:
             Image.fromarray(mask.astype(np.uint8) * 255).save(temporary, format="PNG")
     return place
