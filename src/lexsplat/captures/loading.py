@@ -9,14 +9,15 @@ from shlex import quote
 
 from lexsplat.captures.capture import Capture, View, stem_of
 from lexsplat.captures.ground_truth.layouts import annotated_names
+from lexsplat.captures.images.listing import is_image_file, some_of
 from lexsplat.captures.images.masks import (
     IGNORE_FOLDER,
+    INVERTED,
     blank_masks,
     find_ignore_masks,
-    some_of,
     transparency_note,
 )
-from lexsplat.captures.images.reading import IMAGE_SUFFIXES, image_size, sizes_agree, transparency_of
+from lexsplat.captures.images.reading import image_size, sizes_agree, transparency_of
 from lexsplat.captures.images.undistortion import pinhole_of
 from lexsplat.captures.readers.camera_files import CameraFiles, Photo
 from lexsplat.captures.readers.colmap import find_model, read_colmap
@@ -121,15 +122,14 @@ def _blank(views: Mapping[str, View], root: Path) -> list[str]:
         CaptureError: If no other photo is left.
     """
     blank = blank_masks({name: view.ignore_path for name, view in views.items() if view.ignore_path})
-    remedy = "black is ignored and white is used: if the masks are the wrong way round, invert them"
     if blank and len(blank) == len(views):
-        raise CaptureError(root, expected="masks with white pixels", found="only black ones", remedy=remedy)
+        raise CaptureError(root, expected="masks with white pixels", found="only black ones", remedy=INVERTED)
     if not blank:
         return []
     told = (
         f"{len(blank)} of {len(views)} photos take no part, because their masks are black: {some_of(blank)}"
     )
-    return [f"{root}: {told}; {remedy}"]
+    return [f"{root}: {told}; {INVERTED}"]
 
 
 def _missing_files(files: CameraFiles) -> list[str]:
@@ -225,7 +225,7 @@ def _has_cameras(path: Path) -> bool:
 
 def _photos_of(path: Path) -> list[Path]:
     folders = [folder for folder in (path, path / "images") if folder.is_dir()]
-    return sorted(f for folder in folders for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted(f for folder in folders for f in folder.iterdir() if is_image_file(f))
 
 
 def _make_view(photo: Photo, files: CameraFiles, downscale: float, mask: Path | None) -> View:
