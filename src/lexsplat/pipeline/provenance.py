@@ -25,6 +25,7 @@ from lexsplat.runtime.fingerprints import file_hash, fingerprint
 from lexsplat.scenes.facts import is_of_chosen_views
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.previous import keep_previous
+from lexsplat.scenes.views import PhotoLens
 
 log = logging.getLogger("lexsplat")
 
@@ -53,7 +54,7 @@ def write_provenance(
     views = _cameras_with_split(capture)
     keep_previous(folder)
     folder.save()
-    folder.write_cameras(views)
+    folder.write_cameras(views, {name: PhotoLens.of(view.lens) for name, view in capture.views.items()})
     _write_world(folder, config.up, {name: camera for name, (camera, _) in views.items()})
     if "images" not in folder.record:
         folder.record["capture"] = str(Path(capture.root).resolve())
