@@ -116,10 +116,12 @@ class TestTransforms:
         np.testing.assert_allclose(image[0, 0], [1, 0, 0])
         np.testing.assert_allclose(image[15, 5], [0.8, 0.8, 1.0], atol=1e-6)
         np.testing.assert_allclose(image[15, 15], [1, 1, 1])
+        assert view.load_valid() is None, "nothing is there: no mask, but white"
 
     def test_only_nerf_synthetic_has_a_white_background(self, tmp_path):
         document = write_transforms(tmp_path, NAMES[:2])
         rgba = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+        rgba[: HEIGHT // 2, :, 3] = 255
         for name in NAMES[:2]:
             Image.fromarray(rgba).save(tmp_path / "images" / name)
         assert load_capture(tmp_path).background == (0.0, 0.0, 0.0)
@@ -206,8 +208,8 @@ class TestImages:
         [
             ("L", 51, 0.2),
             ("RGB", (51, 51, 51), 0.2),
-            ("RGBA", (255, 255, 255, 51), 0.2),
-            ("LA", (255, 51), 0.2),
+            ("RGBA", (51, 51, 51, 255), 0.2),
+            ("LA", (51, 255), 0.2),
             ("P", 51, None),
             ("1", 1, 1.0),
             ("I;16", 13107, 0.2),

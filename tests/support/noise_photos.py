@@ -30,6 +30,11 @@ class FakeView:
     lens: FakeLens = FakeLens()
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ignore_path: Path | None = None
+    ignores_transparent: bool = False
+
+    @property
+    def is_masked(self):
+        return self.ignore_path is not None or self.ignores_transparent
 
     @property
     def stem(self):

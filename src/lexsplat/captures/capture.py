@@ -41,7 +41,9 @@ class View:
         capture_size: Width and height of the undistorted photo at full resolution, in pixels.
         lens: The lens of the photo, at the photo's size on disk.
         background: Color behind transparent pixels, RGB in 0..1.
-        ignore_path: Mask of the photo (from ``masks/``), black where pixels are ignored; None if no pixel is.
+        ignore_path: Mask of the photo (from ``masks/``), black where pixels are ignored; None if there is none.
+        ignores_transparent: Whether transparent pixels of the photo are ignored, too, rather than being
+            ``background``.
     """
 
     name: str
@@ -51,6 +53,12 @@ class View:
     lens: Lens
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ignore_path: Path | None = None
+    ignores_transparent: bool = False
+
+    @property
+    def is_masked(self) -> bool:
+        """Whether pixels of the photo may be ignored, by a mask or because they are transparent."""
+        return self.ignore_path is not None or self.ignores_transparent
 
     @property
     def stem(self) -> str:
@@ -71,8 +79,9 @@ class View:
             ValueError: If ``size`` is not positive.
         """
         size = self._checked_size(size)
-        source: Rows = PhotoRows(self.image_path, self.background)
-        found, remapped = (source.width, source.height), False
+        photo = PhotoRows(self.image_path, None if self.ignores_transparent else self.background)
+        source: Rows = photo
+        found, remapped = (photo.width, photo.height), False
         if found != (self.lens.width, self.lens.height):
             raise CaptureError(
                 self.image_path,
@@ -80,8 +89,8 @@ class View:
                 found=f"{found[0]}x{found[1]}",
                 remedy="the file changed since the capture was loaded; load it again",
             )
-        if self.ignore_path is not None:
-            mask, remapped = self._valid_pixels(self.ignore_path)
+        if self.is_masked:
+            mask, remapped = self._valid_pixels(photo)
             if remapped:
                 source = RemappedRows(source, self.lens, self.capture_size)
             source = FilledRows(source, mask)
@@ -89,13 +98,25 @@ class View:
             return undistort(source, self.lens, size)
         return resized(source, size)
 
-    def _valid_pixels(self, path: Path) -> tuple[NDArray[np.bool_], bool]:
-        """Valid pixels of a mask at the size of the photo it was drawn on, and whether that is undistorted."""
-        mask = read_mask(path, nonzero=True)
-        self._check_aspect(path, (mask.shape[1], mask.shape[0]))
+    def _valid_pixels(self, photo: PhotoRows | None = None) -> tuple[NDArray[np.bool_], bool]:
+        """Valid pixels of a masked photo, and whether they are those of the undistorted photo, as its mask may be."""
+        opaque = (photo or PhotoRows(self.image_path)).opaque() if self.ignores_transparent else None
+        if self.ignore_path is None:
+            return np.ones((self.lens.height, self.lens.width), bool) if opaque is None else opaque, False
+        mask = read_mask(self.ignore_path, nonzero=True)
+        self._check_aspect(self.ignore_path, (mask.shape[1], mask.shape[0]))
         undistorted = self._is_undistorted(mask)
-        size = self.capture_size if undistorted else (self.lens.width, self.lens.height)
-        return resize_nearest(mask, size), undistorted
+        mask = resize_nearest(mask, self.capture_size if undistorted else (self.lens.width, self.lens.height))
+        if opaque is None:
+            return mask, undistorted
+        if undistorted:
+            opaque = self._widened(~opaque, self.capture_size) < 1e-4
+        return mask & opaque, undistorted
+
+    def _widened(self, ignored: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.float32]:
+        """Share of each undistorted pixel ``[H, W]`` that ignored pixels of the photo contribute to."""
+        # Bicubic interpolation has a support of two pixels.
+        return undistort(MaskRows(ignored, reach=2), self.lens, size)[..., 0]
 
     def load_mask(self, path: Path, size: tuple[int, int] | None = None) -> NDArray[np.bool_]:
         """A mask drawn on the photo as ``[H, W]`` bool on the undistorted image, by nearest pixel.
@@ -143,14 +164,13 @@ class View:
         Raises:
             CaptureError: As :meth:`load_mask`.
         """
-        if self.ignore_path is None:
+        if not self.is_masked:
             return None
         size = self._checked_size(size)
-        mask, undistorted = self._valid_pixels(self.ignore_path)
+        mask, undistorted = self._valid_pixels()
         if undistorted or not self.lens.distorts:
             return 1.0 - resized(MaskRows(~mask), size)[..., 0]
-        # Bicubic interpolation has a support of two pixels.
-        return 1.0 - undistort(MaskRows(~mask, reach=2), self.lens, size)[..., 0]
+        return 1.0 - self._widened(~mask, size)
 
     def check_mask(self, path: Path) -> None:
         """Compare a mask's size with the photo's by their headers.

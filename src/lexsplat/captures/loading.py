@@ -9,8 +9,15 @@ from shlex import quote
 
 from lexsplat.captures.capture import Capture, View, stem_of
 from lexsplat.captures.ground_truth.layouts import annotated_names
-from lexsplat.captures.images.masks import IGNORE_FOLDER, blank_masks, find_ignore_masks
-from lexsplat.captures.images.reading import IMAGE_SUFFIXES, image_size, sizes_agree
+from lexsplat.captures.images.listing import is_image_file, some_of
+from lexsplat.captures.images.masks import (
+    IGNORE_FOLDER,
+    INVERTED,
+    blank_masks,
+    find_ignore_masks,
+    transparency_note,
+)
+from lexsplat.captures.images.reading import image_size, sizes_agree, transparency_of
 from lexsplat.captures.images.undistortion import pinhole_of
 from lexsplat.captures.readers.camera_files import CameraFiles, Photo
 from lexsplat.captures.readers.colmap import find_model, read_colmap
@@ -60,7 +67,7 @@ def load_capture(
         photo.name: _make_view(photo, files, downscale, masked.get(photo.name))
         for photo in sorted(files.photos, key=lambda photo: photo.name)
     }
-    warnings += _blank(views, files.root)
+    warnings += [*_transparent(views, files.root), *_blank(views, files.root)]
     _check_names([photo.name for photo in files.photos], files.origin)
     root = files.root if beside is None else Path(beside)
     chosen, split_warnings = choose_test_names(
@@ -86,6 +93,28 @@ def load_capture(
     )
 
 
+def _transparent(views: Mapping[str, View], root: Path) -> list[str]:
+    """A note that counts the photos of which transparent pixels are ignored, if there are any.
+
+    Raises:
+        CaptureError: If nothing but transparent pixels is there.
+    """
+    found = {
+        name: transparency_of(view.image_path) for name, view in views.items() if view.ignores_transparent
+    }
+    hidden = [name for name, each in found.items() if each.hides]
+    clear = [name for name in hidden if found[name].hides_all]
+    if clear and len(clear) == len(views):
+        remedy = "save the photos without an alpha channel"
+        raise CaptureError(
+            root, expected="photos that can be seen", found="only transparent ones", remedy=remedy
+        )
+    notes = [transparency_note(root, hidden)] if hidden else []
+    if clear:
+        notes.append(f"{root}: transparent throughout, so that they take no part: {some_of(clear)}")
+    return notes
+
+
 def _blank(views: Mapping[str, View], root: Path) -> list[str]:
     """A warning that counts the photos of which a mask leaves nothing, if there are any.
 
@@ -93,14 +122,14 @@ def _blank(views: Mapping[str, View], root: Path) -> list[str]:
         CaptureError: If no other photo is left.
     """
     blank = blank_masks({name: view.ignore_path for name, view in views.items() if view.ignore_path})
-    remedy = "black is ignored and white is used: if the masks are the wrong way round, invert them"
     if blank and len(blank) == len(views):
-        raise CaptureError(root, expected="masks with white pixels", found="only black ones", remedy=remedy)
+        raise CaptureError(root, expected="masks with white pixels", found="only black ones", remedy=INVERTED)
     if not blank:
         return []
-    some = ", ".join(blank[:3]) + (" and more" if len(blank) > 3 else "")
-    told = f"{len(blank)} of {len(views)} photos take no part, because their masks are black: {some}"
-    return [f"{root}: {told}; {remedy}"]
+    told = (
+        f"{len(blank)} of {len(views)} photos take no part, because their masks are black: {some_of(blank)}"
+    )
+    return [f"{root}: {told}; {INVERTED}"]
 
 
 def _missing_files(files: CameraFiles) -> list[str]:
@@ -196,7 +225,7 @@ def _has_cameras(path: Path) -> bool:
 
 def _photos_of(path: Path) -> list[Path]:
     folders = [folder for folder in (path, path / "images") if folder.is_dir()]
-    return sorted(f for folder in folders for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES)
+    return sorted(f for folder in folders for f in folder.iterdir() if is_image_file(f))
 
 
 def _make_view(photo: Photo, files: CameraFiles, downscale: float, mask: Path | None) -> View:
@@ -232,6 +261,7 @@ def _make_view(photo: Photo, files: CameraFiles, downscale: float, mask: Path | 
         lens=lens,
         background=files.background,
         ignore_path=photo.ignore_path or mask,
+        ignores_transparent=not files.is_cut_out and transparency_of(photo.path).is_any,
     )
     if view.ignore_path is not None:
         view.check_mask(view.ignore_path)  # report a mask of the wrong size now, not during training

@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 from lexsplat.captures.capture import stem_of
+from lexsplat.captures.images.listing import is_image_file
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 from lexsplat.runtime.files import read_json
 
@@ -77,7 +78,8 @@ def choose_test_names(
 
 def mask_folders(segmentations: Path) -> list[Path]:
     """The folders below ``segmentations`` that hold masks, sorted."""
-    return sorted({path.parent for path in segmentations.rglob("*.png") if path.parent != segmentations})
+    masks = filter(is_image_file, segmentations.rglob("*.png"))
+    return sorted({path.parent for path in masks if path.parent != segmentations})
 
 
 def _resolve(stems: Sequence[str], names: Collection[str], origin: Path) -> set[str]:

@@ -137,7 +137,7 @@ def without_masked_cells(maps: FeatureMaps, capture: Capture) -> FeatureMaps:
         maps: Maps by view name.
         capture: The views.
     """
-    if all(capture.views[name].ignore_path is None for name in maps if name in capture.views):
+    if not any(capture.views[name].is_masked for name in maps if name in capture.views):
         return maps
 
     def load(name: str) -> FeatureMap:

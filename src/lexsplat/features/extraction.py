@@ -203,6 +203,7 @@ def pixels_hash(view: View, size: tuple[int, int]) -> str:
     """Hash of everything the pixels of `View.load_image` depend on: file, lens, background, size and mask."""
     lens = dataclasses.asdict(view.lens)
     masked = [] if view.ignore_path is None else [file_hash(view.ignore_path, 16)]
+    masked += ["transparent"] if view.ignores_transparent else []
     return hash_of(file_hash(view.image_path, 16), lens, list(view.background), size, *masked)
 
 

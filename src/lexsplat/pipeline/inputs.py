@@ -26,7 +26,8 @@ from lexsplat.captures import (
     poses_from_photos,
 )
 from lexsplat.captures.ground_truth.layouts import annotated_names
-from lexsplat.captures.images.reading import IMAGE_SUFFIXES
+from lexsplat.captures.images.listing import images_below, is_image_file
+from lexsplat.captures.images.reading import transparency_of
 from lexsplat.captures.loading import check_capture
 from lexsplat.captures.readers.video import is_video, require_video, sample_video
 from lexsplat.captures.sfm.preparation import (
@@ -36,6 +37,7 @@ from lexsplat.captures.sfm.preparation import (
     photo_folder,
     upright_size,
 )
+from lexsplat.captures.sfm.remarks import copies_of
 from lexsplat.captures.splits import choose_test_names
 from lexsplat.features import check_external_features
 from lexsplat.features.segments2d import check_segments
@@ -64,7 +66,7 @@ def refuse_output_in_capture(source: Path, output: Path) -> None:
         capture = capture.parent
     if not place.is_dir() or not place.is_relative_to(capture):
         return
-    if place == capture or any(file.suffix.lower() in IMAGE_SUFFIXES for file in place.iterdir()):
+    if place == capture or any(map(is_image_file, place.iterdir())):
         raise CaptureError(
             output,
             expected="an output folder of its own",
@@ -296,9 +298,14 @@ def _photos_fingerprint(source: Path, photos: Path, output: Path, config: BuildC
         if not source.is_file():
             raise CaptureError(source, expected="a video", found="no such file", remedy="check the path")
         return fingerprint(settings, source.name, file_sample(source), config.frames)
-    masks = [path for folder in mask_places(photos) for path in sorted(folder.rglob("*")) if path.is_file()]
-    paths = [*(photos / name for name in find_photos(photos, output)), *masks]
-    return fingerprint(settings, [[os.path.relpath(path, photos), file_sample(path)] for path in paths])
+    masks = [path for folder in mask_places(photos) for path in images_below(folder)[0]]
+    names = find_photos(photos, output)
+    copies = copies_of(photos, names)
+    found = [photos / name for name in names if name not in copies]
+    files = [[os.path.relpath(path, photos), file_sample(path)] for path in (*found, *masks)]
+    # Poses that were made when transparent pixels were not ignored are made again.
+    transparent = [os.path.relpath(path, photos) for path in found if transparency_of(path).hides]
+    return fingerprint(settings, files, *filter(None, [transparent]))
 
 
 def reload_capture(folder: SceneFolder, source: Path | None = None) -> Capture:

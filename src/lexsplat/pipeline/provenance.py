@@ -25,6 +25,7 @@ from lexsplat.runtime.fingerprints import file_hash, fingerprint
 from lexsplat.scenes.facts import is_of_chosen_views
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.previous import keep_previous
+from lexsplat.scenes.views import PhotoLens
 
 log = logging.getLogger("lexsplat")
 
@@ -33,9 +34,10 @@ def hash_capture(capture: Capture) -> tuple[dict[str, str], str]:
     """Hashes of the photos by view, and a fingerprint of photos, masks, cameras and split."""
     sources = {name: file_hash(view.image_path) for name, view in capture.views.items()}
     masks = {n: file_hash(v.ignore_path) for n, v in capture.views.items() if v.ignore_path is not None}
+    transparent = [name for name, view in capture.views.items() if view.ignores_transparent]
     splits = _cameras_with_split(capture).items()
     cameras = {n: [c.width, c.height, c.K.tolist(), c.viewmat.tolist(), split] for n, (c, split) in splits}
-    return sources, fingerprint(sources, cameras, masks) if masks else fingerprint(sources, cameras)
+    return sources, fingerprint(sources, cameras, *filter(None, (masks, transparent)))
 
 
 def _cameras_with_split(capture: Capture) -> dict[str, tuple[Camera, str]]:
@@ -52,7 +54,7 @@ def write_provenance(
     views = _cameras_with_split(capture)
     keep_previous(folder)
     folder.save()
-    folder.write_cameras(views)
+    folder.write_cameras(views, {name: PhotoLens.of(view.lens) for name, view in capture.views.items()})
     _write_world(folder, config.up, {name: camera for name, (camera, _) in views.items()})
     if "images" not in folder.record:
         folder.record["capture"] = str(Path(capture.root).resolve())

@@ -31,7 +31,7 @@ from lexsplat.runtime.errors import FileFormatError, SceneFolderError
 from lexsplat.runtime.files import atomic_path, locked, read_json, read_tensors, to_json, write_json
 from lexsplat.runtime.fingerprints import file_checksum
 from lexsplat.scenes.records import FORMAT_VERSION, read_record
-from lexsplat.scenes.views import StoredView, stored_view
+from lexsplat.scenes.views import PhotoLens, StoredView, stored_view
 
 SCENE_FILES = ("scene.json", "cameras.json", "gaussians.ply", "language.safetensors")
 """The files of a finished scene."""
@@ -245,8 +245,11 @@ class SceneFolder:
 
     # -- content
 
-    def write_cameras(self, views: Mapping[str, tuple[Camera, str]]) -> None:
-        """Write ``cameras.json`` from ``{name: (camera, "train" | "test")}``."""
+    def write_cameras(
+        self, views: Mapping[str, tuple[Camera, str]], photos: Mapping[str, PhotoLens] | None = None
+    ) -> None:
+        """Write ``cameras.json`` from ``{name: (camera, "train" | "test")}``, and the lenses of photos by name."""
+        lenses = photos or {}
         entries = [
             {
                 "name": name,
@@ -255,6 +258,7 @@ class SceneFolder:
                 "height": c.height,
                 "K": c.K,
                 "viewmat": c.viewmat,
+                **({"photo": to_json(lenses[name])} if name in lenses else {}),
             }
             for name, (c, split) in views.items()
         ]

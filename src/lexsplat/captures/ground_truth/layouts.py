@@ -23,7 +23,8 @@ from PIL import Image, ImageDraw
 
 from lexsplat.captures.capture import Capture, View, stem_of
 from lexsplat.captures.ground_truth.prompt_lists import PromptList, capture_prompt_names
-from lexsplat.captures.images.reading import IMAGE_SUFFIXES, MAX_PIXELS
+from lexsplat.captures.images.listing import is_image_file
+from lexsplat.captures.images.reading import MAX_PIXELS
 from lexsplat.captures.images.undistortion import MAX_SIDE
 from lexsplat.captures.readers.camera_files import checked_name
 from lexsplat.captures.splits import mask_folders, match_stem
@@ -234,7 +235,7 @@ def _masks_by_prompt(view_folder: Path) -> dict[str, Path]:
         CaptureError: If two names mean one prompt.
     """
     files: dict[str, Path] = {}
-    for path in sorted(view_folder.glob("*.png")):
+    for path in sorted(filter(is_image_file, view_folder.glob("*.png"))):
         other = files.setdefault(path.stem.replace("_", " "), path)
         if other is not path:
             raise CaptureError(
@@ -263,7 +264,7 @@ def _images_meant(stem: str, layout: str, names: Collection[str], image_folder: 
     matches = match_stem(stem, names)
     if layout != "3d-ovs" or not stem.isdigit() or not image_folder.is_dir():
         return matches
-    images = sorted(p.name for p in image_folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+    images = sorted(p.name for p in image_folder.iterdir() if is_image_file(p))
     counted = [images[int(stem)]] if int(stem) < len(images) else []
     if not matches:
         return [name for name in counted if name in names]

@@ -8,6 +8,8 @@ import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from PIL import Image
 
 from lexsplat.captures.images.bands import band_ranges
 from lexsplat.runtime.errors import CaptureError
+from lexsplat.runtime.fingerprints import file_stamp
 
 HEIC_SUFFIXES = (".heic", ".heif")
 """Suffixes of HEIF photos, as Apple's phones take them; reading them requires the library pi-heif."""
@@ -25,6 +28,9 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", *HE
 
 MAX_PIXELS = 2 * (Image.MAX_IMAGE_PIXELS or 0)
 """Largest image that is opened: 179 million pixels. Larger headers are treated as decompression bombs."""
+
+_HALF = 127
+"""Largest alpha, of 255, of a pixel that does not count."""
 
 
 @contextmanager
@@ -122,11 +128,15 @@ class PhotoRows:
 
     The decoded pixels stay in memory, three or four bytes per pixel.
 
+    Args:
+        path: The image.
+        background: Color behind transparent pixels, RGB in 0..1; None takes the colors as stored, without alpha.
+
     Raises:
         CaptureError: As :func:`open_image`.
     """
 
-    def __init__(self, path: Path, background: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+    def __init__(self, path: Path, background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)) -> None:
         with open_image(path) as image:
             image.load()
         self._image, self._background = image, background
@@ -136,21 +146,89 @@ class PhotoRows:
         """Rows ``[last - first, W, 3]``, in 0..1."""
         return _as_floats(self._image.crop((0, first, self.width, last)), self._background)
 
+    def opaque(self) -> NDArray[np.bool_]:
+        """Pixels ``[H, W]`` that are more opaque than half."""
+        alpha = _alpha_of(self._image)
+        return np.ones((self.height, self.width), bool) if alpha is None else np.asarray(alpha) > _HALF
+
 
 def read_bytes(path: Path) -> NDArray[np.uint8]:
-    """An image as ``[H, W, 3]`` uint8, composited on black, rounded.
+    """An image as ``[H, W, 3]`` uint8, rounded; transparent pixels have the colors that are stored with them.
 
     Raises:
         CaptureError: As :func:`open_image`.
     """
-    source = PhotoRows(path)
+    source = PhotoRows(path, None)
     found = np.empty((source.height, source.width, 3), np.uint8)
     for first, last in band_ranges(source.height, source.width):
         found[first:last] = (source.rows(first, last) * 255.0).round()
     return found
 
 
-def _as_floats(image: Image.Image, background: tuple[float, float, float]) -> NDArray[np.float32]:
+@dataclass(frozen=True)
+class Transparency:
+    """How transparent the pixels of an image are.
+
+    Args:
+        least: Alpha of its most transparent pixel, 0..255; 255 if the image is opaque.
+        most: Alpha of its most opaque pixel, 0..255.
+    """
+
+    least: int = 255
+    most: int = 255
+
+    @property
+    def is_any(self) -> bool:
+        """Whether a pixel is at all transparent."""
+        return self.least < 255
+
+    @property
+    def hides(self) -> bool:
+        """Whether a pixel is more transparent than half."""
+        return self.least <= _HALF
+
+    @property
+    def hides_all(self) -> bool:
+        """Whether no pixel is more opaque than half."""
+        return self.most <= _HALF
+
+
+def transparency_of(path: Path) -> Transparency:
+    """The transparency of an image. One without alpha is not decoded, and others are once per process.
+
+    Raises:
+        CaptureError: As :func:`open_image`.
+    """
+    with open_image(path) as image:
+        if not _has_alpha(image):
+            return Transparency()
+    return _decoded_transparency(path, file_stamp(path))
+
+
+@lru_cache(maxsize=1 << 14)
+def _decoded_transparency(path: Path, stamp: tuple[int, int]) -> Transparency:
+    """The transparency of the file with this stamp."""
+    with open_image(path) as image:
+        alpha = _alpha_of(image)
+        if alpha is None:
+            return Transparency()
+        values = np.asarray(alpha)
+        return Transparency(int(values.min()), int(values.max()))
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    """Whether an image has an alpha channel or transparent colors; those of 16-bit gray are not read."""
+    return image.has_transparency_data and not image.mode.startswith(("I", "F"))
+
+
+def _alpha_of(image: Image.Image) -> Image.Image | None:
+    """The alpha channel of an image, in 0..255; None if it has none."""
+    if not _has_alpha(image):
+        return None
+    return image.getchannel("A") if image.mode in ("RGBA", "LA") else image.convert("RGBA").getchannel("A")
+
+
+def _as_floats(image: Image.Image, background: tuple[float, float, float] | None) -> NDArray[np.float32]:
     """All pixels of an image of any mode as floats in 0..1."""
     if image.mode.startswith("I") or image.mode == "F":
         values = np.asarray(image, dtype=np.float32)
@@ -160,6 +238,8 @@ def _as_floats(image: Image.Image, background: tuple[float, float, float]) -> ND
         return np.repeat(gray[..., None], 3, axis=2)
     if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info:
         rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255.0
+        if background is None:
+            return np.ascontiguousarray(rgba[..., :3])
         alpha = rgba[..., 3:]
         return rgba[..., :3] * alpha + np.asarray(background, dtype=np.float32) * (1.0 - alpha)
     pixels = np.asarray(image.convert("RGB"), dtype=np.float32)
@@ -186,7 +266,7 @@ def read_mask(path: Path, *, nonzero: bool = False) -> NDArray[np.bool_]:
         values = np.asarray(image if image.mode.startswith(("I", "F", "1")) else image.convert("L"))
         if image.has_transparency_data:
             alpha = np.asarray(image.convert("RGBA"))[..., 3]
-            values = np.where(alpha > 127, values, 0)
+            values = np.where(alpha > _HALF, values, 0)
     if values.dtype == np.bool_:
         return values
     if nonzero:

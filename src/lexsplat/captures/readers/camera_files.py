@@ -49,6 +49,7 @@ class CameraFiles:
         missing: Names of images that have a camera but no file.
         test_names: The split that the files prescribe, or None.
         background: Color behind transparent pixels.
+        is_cut_out: Whether transparent pixels show the background, so that nothing is there; else they are ignored.
         warnings: Skipped content and the reasons.
     """
 
@@ -60,6 +61,7 @@ class CameraFiles:
     missing: list[str] = field(default_factory=list)
     test_names: list[str] | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    is_cut_out: bool = False
     warnings: list[str] = field(default_factory=list)
 
 

@@ -97,8 +97,9 @@ def read_transforms(file: Path) -> CameraFiles:
         photos=photos,
         missing=missing,
         test_names=test_names,
-        # NeRF-synthetic images are transparent, and its benchmarks composite them on white.
+        # NeRF-synthetic images are transparent where nothing is, and its benchmarks composite them on white.
         background=(1.0, 1.0, 1.0) if synthetic else (0.0, 0.0, 0.0),
+        is_cut_out=synthetic,
     )
 
 

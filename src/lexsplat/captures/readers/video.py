@@ -49,8 +49,8 @@ def is_video(path: Path) -> bool:
 
 
 def videos_in(folder: Path) -> list[str]:
-    """Names of the videos in a folder, sorted."""
-    return sorted(path.name for path in folder.iterdir() if is_video(path))
+    """Names of the videos in a folder, sorted, without hidden files."""
+    return sorted(path.name for path in folder.iterdir() if is_video(path) and not path.name.startswith("."))
 
 
 def require_video(video: Path, folder: Path) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -276,8 +276,8 @@ def matched(database: Path) -> set[str]:
     return {names[number] for pair in kept for number in pycolmap.pair_id_to_image_pair(pair)}
 
 
-def why_unregistered(database: Path, names: Collection[str]) -> dict[str, str]:
-    """The reason why each photo has no pose."""
+def why_unregistered(database: Path, names: Collection[str], blank: Mapping[str, str]) -> dict[str, str]:
+    """The reason why each photo has no pose; ``blank`` has those of photos of which nothing is left."""
     with_matches = matched(database)
     with pycolmap.Database.open(database) as opened:
         counts = {
@@ -285,6 +285,8 @@ def why_unregistered(database: Path, names: Collection[str]) -> dict[str, str]:
         }
 
     def reason(name: str) -> str:
+        if name in blank:
+            return blank[name]
         if counts.get(name, 0) < MIN_MATCHES:
             return "has nothing to match: blurred, dark or without texture"
         return "fits no model of the others" if name in with_matches else "matches no other photo"

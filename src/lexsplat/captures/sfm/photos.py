@@ -181,7 +181,7 @@ def poses_from_photos(
         if best is None:
             _discard(work, output)
             raise _none_registered(folder, len(names))
-        reasons = mapping.why_unregistered(database, mapping.unregistered(names, best))
+        reasons = mapping.why_unregistered(database, mapping.unregistered(names, best), photos.blank)
         mapping.write_model(best.model, output)
     _discard(work, output)
     found = _found(output, photos, best, reasons)

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lexsplat.captures.capture import stem_of
-from lexsplat.captures.images.masks import IGNORE_FOLDER, find_ignore_masks
+from lexsplat.captures.images.listing import hidden_note, images_below, is_image_file
+from lexsplat.captures.images.masks import IGNORE_FOLDER, INVERTED, find_ignore_masks, transparency_note
 from lexsplat.captures.images.reading import (
-    IMAGE_SUFFIXES,
+    PhotoRows,
+    Transparency,
     image_size,
     misfit,
     open_image,
@@ -29,9 +31,18 @@ from lexsplat.captures.images.reading import (
     read_mask,
     resize_nearest,
     sizes_agree,
+    transparency_of,
 )
 from lexsplat.captures.readers.camera_files import checked_name
 from lexsplat.captures.readers.video import videos_in
+from lexsplat.captures.sfm.remarks import (
+    copies_note,
+    copies_of,
+    gray_note,
+    left_out,
+    looks_gray,
+    twins,
+)
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import atomic_path, link_or_copy
@@ -44,11 +55,8 @@ _FOCAL = (0x920A, 0xA405, 0xA20E, 0xA20F, 0xA210)
 """EXIF tags of the focal length: in millimeters, as 35 mm equivalent, and sensor pixels per unit."""
 _APART = (IGNORE_FOLDER, "segmentations")
 _JPEG_QUALITY = 95
-_NOT_READ = (
-    ".gif", ".avif", ".jxl", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".raw", ".psd",
-    ".svg", ".exr", ".hdr",
-)  # fmt: skip
-"""Endings of image files that are not read; cameras write some of them beside their JPEGs."""
+_BLACK_MASK = "has a mask that is black throughout: black is ignored, white is used"
+_TRANSPARENT = "is transparent wherever it is not masked"
 _Found = TypeVar("_Found")
 
 
@@ -63,6 +71,7 @@ class PreparedPhotos:
         masks: Folder with ``NAME.png`` in COLMAP's layout, or None if no photo is masked.
         largest: Width and height of the photo with the most pixels.
         notes: Remarks for the user, one line each.
+        blank: Why nothing of a photo is left, by name, for photos that are masked or transparent throughout.
     """
 
     images: Path
@@ -71,11 +80,12 @@ class PreparedPhotos:
     masks: Path | None
     largest: tuple[int, int]
     notes: tuple[str, ...] = ()
+    blank: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class _Photo:
-    """Header of a photo: its upright size, how it is stored, and its lens."""
+    """Header of a photo: its upright size, how it is stored, its lens, and how transparent and colored it is."""
 
     name: str
     size: tuple[int, int]
@@ -84,12 +94,14 @@ class _Photo:
     lossy: bool
     exif: Image.Exif
     focal: tuple[Any, ...]
+    transparency: Transparency
+    gray: bool
 
 
 def photo_folder(capture: Path) -> Path:
     """The folder that holds the photos: the given one, or its ``images/``."""
     inside = capture / "images"
-    direct = capture.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in capture.iterdir())
+    direct = capture.is_dir() and any(map(is_image_file, capture.iterdir()))
     return inside if inside.is_dir() and not direct else capture
 
 
@@ -97,20 +109,26 @@ def find_photos(folder: Path, without: Path | None = None) -> list[str]:
     """Names of all photos below a folder, relative to it, with "/", sorted.
 
     Args:
-        folder: Folder to search; its ``masks/`` and ``segmentations/`` hold no photos.
+        folder: Folder to search; its ``masks/`` and ``segmentations/`` hold no photos, and hidden files are none.
         without: A folder to skip: the output, where that lies among the photos.
     """
+    return _find(folder, without)[0]
+
+
+def _find(folder: Path, without: Path | None) -> tuple[list[str], list[str]]:
+    """Names of all photos below a folder, and of hidden image files."""
     apart = {folder / name for name in _APART}
     if without is not None and without.resolve() not in (folder.resolve(), *folder.resolve().parents):
         apart.add(without.resolve())
-    found = (
-        path
-        for path in folder.rglob("*")
-        if path.suffix.lower() in IMAGE_SUFFIXES
-        and path.is_file()
-        and apart.isdisjoint([*path.parents, *path.resolve().parents])
+    photos, hidden = (
+        sorted(
+            path.relative_to(folder).as_posix()
+            for path in paths
+            if apart.isdisjoint([*path.parents, *path.resolve().parents])
+        )
+        for paths in images_below(folder)
     )
-    return sorted(path.relative_to(folder).as_posix() for path in found)
+    return photos, hidden
 
 
 def mask_places(folder: Path) -> list[Path]:
@@ -138,16 +156,27 @@ def prepare_photos(
         MemoryBudgetError: If a photo is too large for ``memory``.
     """
     names = checked_photos(folder, output)
+    every, hidden_files = _find(folder, output)
     largest = max(_of_all(names, lambda name: image_size(folder / name)), key=lambda size: size[0] * size[1])
     budget.check_photo(largest, memory)
     photos = _of_all(names, lambda name: _look_at(folder, name))
     largest = max((photo.size for photo in photos), key=lambda size: size[0] * size[1])
-    notes = [f"{folder}: {note}" for note in (*_left_out(folder), *_twins(names))]
-    found, strays = find_ignore_masks(mask_places(folder), names)
+    remarks = [
+        *hidden_note(hidden_files),
+        *left_out(folder),
+        *copies_note(copies_of(folder, every)),
+        *twins(names),
+    ]
+    remarks += gray_note([photo.name for photo in photos if photo.gray], len(photos))
+    notes = [f"{folder}: {remark}" for remark in remarks]
+    found, strays = find_ignore_masks(mask_places(folder), every)
+    found = {name: mask for name, mask in found.items() if name in names}
     notes += strays
     images, renamed = folder, {name: name for name in names}
     unready = not all(photo.plain and photo.orientation == 1 for photo in photos)
-    if unready or found:
+    hidden = [photo.name for photo in photos if photo.transparency.hides]
+    masked = {*found, *hidden}
+    if unready or masked:
         _refuse_output_among_photos(folder, output)
     if unready:
         images = output / "images"
@@ -157,15 +186,18 @@ def prepare_photos(
         converted = sum(not photo.plain for photo in photos)
         done = f"rotated upright: {turned}; converted to JPEG or PNG: {converted}"
         notes.append(f"copies of photos are in {images}: {done}")
-    masks = None
-    if found:
-        masks = _write_masks(photos, found, renamed, output)
-        notes.append(f"{len(found)} of {len(names)} photos are masked")
+    masks, blank = None, dict[str, str]()
+    if hidden:
+        notes.append(transparency_note(folder, hidden))
+    if masked:
+        masks, blank = _write_masks(photos, folder, found, renamed, output)
+        notes.append(f"{len(masked)} of {len(names)} photos are masked")
     groups: dict[tuple[Any, ...], list[str]] = {}
     for photo in photos:
         groups.setdefault((photo.size, photo.focal), []).append(renamed[photo.name])
     lenses = tuple(tuple(sorted(group)) for group in groups.values())
-    return PreparedPhotos(images, tuple(sorted(renamed.values())), lenses, masks, largest, tuple(notes))
+    ordered = tuple(sorted(renamed.values()))
+    return PreparedPhotos(images, ordered, lenses, masks, largest, tuple(notes), blank)
 
 
 def _of_all(names: Sequence[str], look: Callable[[str], _Found]) -> list[_Found]:
@@ -191,38 +223,8 @@ def _of_all(names: Sequence[str], look: Callable[[str], _Found]) -> list[_Found]
     return found
 
 
-def _left_out(folder: Path) -> list[str]:
-    """A note on image files of formats that are not read, and one on videos, if there are any."""
-    other = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in _NOT_READ and p.is_file())
-    notes = []
-    if other:
-        told = "is left out: its format is" if len(other) == 1 else "are left out: their formats are"
-        notes.append(f"{_some(other)} {told} not read; save as JPEG or PNG")
-    if videos := videos_in(folder):
-        told = "is" if len(videos) == 1 else "are"
-        notes.append(f"{_some(videos)} {told} left out: a video is given by itself, without photos")
-    return notes
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (" and more" if len(names) > 3 else "")
-
-
-def _twins(names: Sequence[str]) -> list[str]:
-    """A note on photos that differ in their endings only, as phones export a photo in two formats."""
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        groups.setdefault(stem_of(name), []).append(name)
-    twins = [group for group in groups.values() if len(group) > 1]
-    if not twins:
-        return []
-    count = "1 pair" if len(twins) == 1 else f"{len(twins):,} pairs"
-    told = f"{count} of photos with one name and two endings, such as {' and '.join(twins[0][:2])}"
-    return [f"{told}: the same shot twice? Keep one of them"]
-
-
 def checked_photos(folder: Path, output: Path) -> list[str]:
-    """The names of `find_photos`.
+    """The names of `find_photos`, without exact copies of photos (`copies_of`).
 
     Raises:
         CaptureError: If they are fewer than three, or camera files cannot hold one of them.
@@ -234,16 +236,18 @@ def checked_photos(folder: Path, output: Path) -> list[str]:
             found="a file" if folder.exists() else "no such folder",
             remedy="give a folder" if folder.exists() else "check the path",
         )
-    names = find_photos(folder, output)
+    every = find_photos(folder, output)
+    copies = copies_of(folder, every)
+    names = [name for name in every if name not in copies]
     if len(names) < 3:
         videos = videos_in(folder)
         raise CaptureError(
             folder,
             expected="at least 3 photos",
-            found="; ".join([str(len(names)), *_left_out(folder)]),
+            found="; ".join([str(len(names)), *copies_note(copies), *left_out(folder)]),
             remedy=f"give {folder / videos[0]}" if videos else "take 30 or more photos around the place",
         )
-    for name in names:
+    for name in every:
         if not _can_be_listed(folder, name):
             raise CaptureError(
                 str(folder).encode("utf-8", "backslashreplace").decode("utf-8"),
@@ -284,18 +288,20 @@ def _look_at(folder: Path, name: str) -> _Photo:
         plain = image.format in ("JPEG", "PNG") and image.mode in ("L", "RGB")
         plain = plain and "transparency" not in image.info
         lossy = image.format not in ("PNG", "TIFF", "BMP")
+        gray = image.mode in ("1", "L", "LA", "I", "I;16", "F")
         if plain:
             # Decoding at an eighth of the size finds truncated files now, in 50 ms for 12 megapixels. The other
             # photos are decoded in full when they are converted.
             image.draft("RGB", (max(1, width // 8), max(1, height // 8)))
             image.load()
+            gray = looks_gray(image)
     orientation = exif.get(_ORIENTATION, 1)
     if orientation not in range(1, 9):
         orientation = 1
     sensor = exif.get_ifd(_EXIF)
     focal = (exif.get(_MAKE), exif.get(_MODEL), *(str(sensor.get(tag)) for tag in _FOCAL))
     size = (height, width) if orientation >= 5 else (width, height)
-    return _Photo(name, size, orientation, plain, lossy, exif, focal)
+    return _Photo(name, size, orientation, plain, lossy, exif, focal, transparency_of(path), gray)
 
 
 def turned_upright(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
@@ -367,18 +373,42 @@ def _write_upright(photo: _Photo, source: Path, target: Path) -> None:
 
 
 def _write_masks(
-    photos: Sequence[_Photo], found: dict[str, Path], renamed: dict[str, str], output: Path
-) -> Path:
-    """Write masks in COLMAP's layout: ``NAME.png``, black and white, upright, of the photo's size."""
-    place = output / IGNORE_FOLDER
+    photos: Sequence[_Photo], folder: Path, found: dict[str, Path], renamed: dict[str, str], output: Path
+) -> tuple[Path, dict[str, str]]:
+    """Write masks in COLMAP's layout: ``NAME.png``, black and white, upright, of the photo's size.
+
+    Black is what the photo's mask in ``found`` ignores, and what is transparent in the photo.
+
+    Returns:
+        Their folder, and why nothing is left of a photo, by its new name, for photos of which nothing is.
+
+    Raises:
+        CaptureError: If a mask does not fit its photo, or nothing is left of any photo.
+    """
+    place, blank = output / IGNORE_FOLDER, dict[str, str]()
     shutil.rmtree(place, ignore_errors=True)
     for photo in photos:
-        if photo.name not in found:
+        if photo.name not in found and not photo.transparency.hides:
             continue
-        mask = _fitted_mask(read_mask(found[photo.name], nonzero=True), photo, found[photo.name])
+        mask = np.ones(photo.size[::-1], bool)
+        if photo.name in found:
+            mask = _fitted_mask(read_mask(found[photo.name], nonzero=True), photo, found[photo.name])
+        by_mask = not mask.any()
+        if photo.transparency.hides:
+            mask = mask & turned_upright(PhotoRows(folder / photo.name).opaque(), photo.orientation)
         with atomic_path(place / f"{renamed[photo.name]}.png") as temporary:
             Image.fromarray(mask.astype(np.uint8) * 255).save(temporary, format="PNG")
-    return place
+        if not mask.any():
+            blank[renamed[photo.name]] = _BLACK_MASK if by_mask else _TRANSPARENT
+    if len(blank) == len(photos):
+        shutil.rmtree(place)
+        raise CaptureError(
+            folder,
+            expected="photos that are not masked throughout",
+            found="only such photos",
+            remedy=INVERTED,
+        )
+    return place, blank
 
 
 def _fitted_mask(mask: NDArray[np.bool_], photo: _Photo, subject: Path) -> NDArray[np.bool_]:

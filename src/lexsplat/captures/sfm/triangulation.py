@@ -357,6 +357,7 @@ def _cache_key(views: tuple[View, ...], seed: int) -> str:
             view.background,
             None if view.ignore_path is None else file_stamp(view.ignore_path),
             view.camera.viewmat.tolist(),
+            *(["transparent"] if view.ignores_transparent else []),
         ]
         for view in views
     ]
