@@ -88,7 +88,8 @@ def whole_things(chosen: Selection, hidden: Tensor, segments: Segments | None) -
     """A selection extended by the borders of its things and the hidden Gaussians in them.
 
     A segment belongs to it if half of what the views show of the segment does. A hidden Gaussian belongs to it if two
-    of its six nearest neighbors that can be seen do, and it lies within the convex hull of a thing.
+    of its six nearest neighbors that can be seen do, and it lies within the convex hull of a thing. A Gaussian of a
+    fill belongs to what the fill continues, wherever it lies.
 
     Args:
         chosen: The selection.
@@ -97,7 +98,7 @@ def whole_things(chosen: Selection, hidden: Tensor, segments: Segments | None) -
     """
     if segments is None or not chosen:
         return chosen
-    shown = _with_borders(chosen, segments)
+    shown, hidden = _with_borders(chosen, segments), _without_fills(hidden, segments)
     whole = replace(shown, mask=shown.mask | inside_hulls(shown, _beside(shown, hidden)))
     return _with_borders(whole, segments)
 
@@ -111,9 +112,14 @@ def with_remains(chosen: Selection, hidden: Tensor, segments: Segments | None) -
     """
     if segments is None or not chosen:
         return replace(chosen, mask=chosen.mask | inside_hulls(chosen, hidden))
-    shown = _with_borders(chosen, segments)
+    shown, hidden = _with_borders(chosen, segments), _without_fills(hidden, segments)
     whole = replace(shown, mask=shown.mask | _beside(shown, hidden))
     return _with_borders(replace(whole, mask=whole.mask | inside_hulls(whole, hidden)), segments)
+
+
+def _without_fills(hidden: Tensor, segments: Segments) -> Tensor:
+    """The hidden Gaussians ``[N]`` bool without those of fills, whose segments tell what they belong to."""
+    return hidden if segments.added is None else hidden & ~segments.added.to(hidden.device)
 
 
 def _with_borders(chosen: Selection, segments: Segments) -> Selection:

@@ -5,7 +5,9 @@
 2. Gaussians of the reconstruction in the hole are deleted, because no photo shows them. So are those near the thing
    that show mostly without it: few pixels of the photos told their colors.
 3. The pattern of the surface is continued in the hole (`lexsplat.scenes.completing`), in an image from above. Each
-   painted pixel becomes a flat Gaussian. It takes the language of its nearest neighbor in the surface.
+   painted pixel becomes a flat Gaussian. It takes the language of what it continues: of a neighbor in the surface,
+   near by and of a like color (`_sources`). Under a thing at the edge of a cloth, a part of the fill is cloth and the
+   rest is table.
 
 Where no plane is found, such as below a hanging lamp, nothing is filled.
 """
@@ -30,12 +32,14 @@ from torch import Tensor
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.language.segments import Segments
+from lexsplat.queries.colors import cielab
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.visibility import inside_hull
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.completing import completed
 from lexsplat.scenes.surfaces import (
     FEWEST,
+    REACH,
     THICK,
     Orthophoto,
     from_above,
@@ -70,6 +74,8 @@ _SHEET = 0.5
 """A thing lower than this share of its radius carries others."""
 _WAVES = 0.1
 """Largest height of waves of the surface, in radii of the foot: what is higher around it are things."""
+_ALIKE = 50.0
+"""Difference of colors in CIELAB that is as far as a radius of the foot, where a fill takes its language."""
 _OPAQUE = 3.0
 _FLAT, _LARGE = 0.5, 0.25
 """A segment of which less is flat rises from the surface, unless it is this share of the scene, as a group is."""
@@ -210,31 +216,53 @@ def _fill_below(
         return None
     painted = completed(photo.colors, hole, known * (_UNSEEN + photo.shown))
     thin = flat & (np.abs(local[:, 2]) <= _WAVES * surface.radius)  # a banana on a cloth is none of its waves
-    members = np.flatnonzero(thin & ~inside & _of_surface(thin, segments))
+    near = np.linalg.norm(local[:, :2] - surface.foot, axis=1) <= REACH * surface.radius
+    counted = solid & near & ~gone & (shown | ~shown.any())  # nobody knows what hidden Gaussians are
+    low = counted & (local[:, 2] <= _WAVES * surface.radius)
+    members = np.flatnonzero(thin & ~inside & counted & _of_surface(low, counted, segments))
     if not len(members):
         members = np.flatnonzero(flat & ~inside)
     gone |= inside
     waves = known & (np.abs(heights) <= _WAVES * surface.radius)
     raised = _continued(heights, hole, waves if waves.sum() >= FEWEST else known)
     places = np.concatenate([photo.cells[hole], raised[:, None]], 1)
-    _, nearest = cKDTree(local[members, :2]).query(photo.cells[hole])
+    colors = gaussians.sh0.detach().cpu().double().numpy()[members, 0] * SH_C0 + 0.5
+    nearest = _sources(local[members, :2] / surface.radius, colors, photo.cells[hole] / surface.radius, painted)
     x, y, z, w = Rotation.from_matrix(surface.axes.T).as_quat()
     same = np.tile([w, x, y, z, *np.log(photo.size * np.array(_SIZES))], (len(painted), 1))
     disks = np.concatenate([surface.origin + places @ surface.axes, same, painted], 1).astype("<f4")
     return Fill(members[nearest].astype("<i4"), disks)
 
 
-def _of_surface(flat: Mask, segments: Segments | None) -> Mask:
-    """Which Gaussians ``[N]`` belong to no segment that rises from the surface, such as the rim of a pumpkin."""
-    found = np.ones(len(flat), bool)
+def _of_surface(low: Mask, counted: Mask, segments: Segments | None) -> Mask:
+    """Which Gaussians ``[N]`` belong to no segment that rises from the surface, such as the rim of a pumpkin.
+
+    Args:
+        low: Those near by that are no higher than the surface; the sides of a table are lower.
+        counted: Those near by: what a table is far away, or inside, says nothing.
+        segments: The segments; None has nothing that rises.
+    """
+    found = np.ones(len(low), bool)
     if segments is not None:
         labels = segments.labels.cpu().numpy()
         for level in segments.levels.cpu().numpy():
             members = level[labels]
-            sizes = np.bincount(members)
-            rises = np.bincount(members, flat) < _FLAT * sizes
-            found &= ~(rises & (sizes < _LARGE * len(flat)))[members]
+            rises = np.bincount(members, low) < _FLAT * np.bincount(members, counted)
+            found &= ~(rises & (np.bincount(members) < _LARGE * len(low)))[members]
     return found
+
+
+def _sources(places: FloatArray, colors: FloatArray, at: FloatArray, painted: FloatArray) -> NDArray[np.int64]:
+    """What each pixel of a fill continues ``[F]``: a Gaussian of the surface near by and of a like color.
+
+    Args:
+        places: Places of the Gaussians ``[M, 2]``, in radii of the foot.
+        colors: Their RGB ``[M, 3]``.
+        at: Places of the pixels ``[F, 2]``.
+        painted: Their RGB ``[F, 3]``.
+    """
+    known = cKDTree(np.concatenate([places, cielab(colors.clip(0, 1)) / _ALIKE], 1))
+    return np.asarray(known.query(np.concatenate([at, cielab(painted) / _ALIKE], 1))[1])
 
 
 def _standing(local: FloatArray, thing: Mask, among: Mask) -> Mask:

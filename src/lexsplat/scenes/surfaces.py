@@ -39,7 +39,7 @@ FEWEST = 30
 """Fewest Gaussians that make a plane, and fewest pixels that make a fill."""
 _PIXELS = (64, 112, 224)
 """Width of the image from above: at least, without views, and at most."""
-_REACH = 3.0
+REACH = 3.0
 """Half of its width, in radii of the foot."""
 _VIEWS, _LONG_SIDE = 16, 240
 """Number and longer side of the views that are looked at."""
@@ -210,7 +210,7 @@ def from_above(
     gaussians: Gaussians, surface: Surface, members: Mask, cells: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Colors ``[P, P, 3]``, coverage and heights over the plane ``[P, P]`` of some Gaussians from far above."""
-    count, reach = len(cells), _REACH * surface.radius
+    count, reach = len(cells), REACH * surface.radius
     away = 100 * surface.radius
     rotation = surface.axes * np.array([[1.0], [-1.0], [-1.0]])
     eye = surface.origin + surface.foot @ surface.axes[:2] + away * surface.axes[2]
@@ -234,7 +234,7 @@ def from_above(
 
 def _cells(surface: Surface, cameras: Sequence[Camera]) -> tuple[FloatArray, float]:
     """The pixels of an image from above, about as fine as the views, and their width."""
-    reach = _REACH * surface.radius
+    reach = REACH * surface.radius
     least, count, most = _PIXELS
     place = surface.origin + surface.foot @ surface.axes[:2]
     depths = [(camera.viewmat[2, :3] @ place + camera.viewmat[2, 3], camera.K[0, 0]) for camera in cameras]
