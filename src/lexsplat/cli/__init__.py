@@ -170,7 +170,7 @@ def _run(words: list[str]) -> int:
 
 
 def _flush() -> None:
-    """Write what is left of the output, so that `main` notices a reader that has ended, before the interpreter does."""
+    """Write what is left of the output: `main` is to notice a reader that has ended before the interpreter does."""
     if sys.stdout is not None:  # None if it is closed, as in `lexsplat info SCENE >&-`
         sys.stdout.flush()
 
