@@ -117,8 +117,8 @@ def test_a_web_like_encoder_has_the_cosines_of_clip_for_phrases_and_photos_of_th
     web_like, held_out
 ):
     found, facts = measure(web_like, held_out), Facts()
-    # The draw of private directions depends on the signs of eigenvectors, which are those that a processor finds. With
-    # other signs images have .528 to .533, and what matches .301 to .311.
+    # The draw of private directions depends on the signs of eigenvectors, which depend on the processor. With other
+    # signs images have .528 to .533, and what matches .301 to .311.
     assert found["images"] == pytest.approx(facts.images, abs=0.035)
     assert found["texts"] == pytest.approx(facts.texts, abs=0.03)
     assert found["matched"] == pytest.approx(facts.matched, abs=0.035)
