@@ -164,7 +164,9 @@ sys.exit(main())
         [sys.executable, "-c", interrupting], capture_output=True, text=True, timeout=120, check=False
     )
     said = [line for line in done.stderr.splitlines(keepends=True) if not line.startswith("start: ")]
-    assert (done.returncode, said) == (130, [STOPPED]), "on a slow machine the progress of the start comes first"
+    assert (done.returncode, said) == (130, [STOPPED]), (
+        "on a slow machine the progress of the start comes first"
+    )
 
 
 def output_in_a_terminal(*words: str, **environment: str) -> tuple[str, str]:
@@ -233,7 +235,10 @@ def test_a_closed_pipe_ends_a_command_quietly(arguments):
 @pytest.mark.slow
 def test_a_closed_pipe_ends_a_process_quietly():
     command = [sys.executable, "-m", "lexsplat", "build", "--help"]
-    environment = {**os.environ, "PYTHONUNBUFFERED": ""}  # without a buffer, the end has nothing left to write
+    environment = {
+        **os.environ,
+        "PYTHONUNBUFFERED": "",
+    }  # without a buffer, the end has nothing left to write
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment) as process:
         process.stdout.close()  # as `| head` does, before the first line

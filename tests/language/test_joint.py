@@ -17,7 +17,8 @@ from lexsplat.runtime.training import Checkpoint
 
 pytestmark = pytest.mark.slow
 
-GEOMETRY = ReconstructionConfig(iterations=120, sh_degree=1, densify_min_every=10, max_gaussians=3000)
+STEPS = 80
+GEOMETRY = ReconstructionConfig(iterations=STEPS, sh_degree=1, densify_min_every=10, max_gaussians=3000)
 LANGUAGE = TrainedConfig(pixel_sample=256, smoothing_sample=64)
 CODES = 4
 
@@ -82,17 +83,17 @@ def test_a_resumed_joint_training_is_bit_identical(capture, points, tmp_path):
     whole = trainer(capture, points)
     whole.run()
 
-    class StopsAtSixty(Checkpoint):
+    class StopsHalfway(Checkpoint):
         def after_step(self, trainer) -> None:
-            if trainer.reconstructor.steps_done == 60:
+            if trainer.reconstructor.steps_done == STEPS // 2:
                 self.save(trainer)
                 raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        trainer(capture, points).run(checkpoint=StopsAtSixty(tmp_path / "state", "same"))
+        trainer(capture, points).run(checkpoint=StopsHalfway(tmp_path / "state", "same"))
     resumed = trainer(capture, points)
     assert Checkpoint(tmp_path / "state", "same").resume(resumed)
-    assert resumed.reconstructor.steps_done == 60
+    assert resumed.reconstructor.steps_done == STEPS // 2
     resumed.run()
     for (name, ours), theirs in zip(
         whole.result()[1].tensors().items(), resumed.result()[1].tensors().values()

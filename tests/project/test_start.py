@@ -51,7 +51,8 @@ ALLOWED = {
 """Libraries that a command may load."""
 
 WARMER = (
-    (), ("tyro", "rich"), ("torch", "numpy"), ("PIL.Image",), ("scipy.ndimage", "scipy.sparse", "scipy.spatial"),
+    (), ("tyro", "rich.progress", "rich.table"), ("torch", "numpy"), ("PIL.ImageFont",),
+    ("scipy.cluster.hierarchy", "scipy.ndimage", "scipy.sparse.csgraph", "scipy.spatial"),
     ("safetensors.torch",), ("numba",),
 )  # fmt: skip
 """Libraries in the order in which the process imports them whose forks the programs are.

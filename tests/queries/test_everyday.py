@@ -117,10 +117,11 @@ def test_a_web_like_encoder_has_the_cosines_of_clip_for_phrases_and_photos_of_th
     web_like, held_out
 ):
     found, facts = measure(web_like, held_out), Facts()
-    # The private directions are drawn in a basis that the processor's decompositions choose: .520 to .530 were found.
+    # The draw of private directions depends on the signs of eigenvectors, which depend on the processor. With other
+    # signs images have .528 to .533, and what matches .301 to .311.
     assert found["images"] == pytest.approx(facts.images, abs=0.035)
     assert found["texts"] == pytest.approx(facts.texts, abs=0.03)
-    assert found["matched"] == pytest.approx(facts.matched, abs=0.03)
+    assert found["matched"] == pytest.approx(facts.matched, abs=0.035)
     assert found["unmatched"] == pytest.approx(facts.unmatched, abs=0.02)
     assert found["canonical"] == pytest.approx(facts.canonical, abs=0.02)
     assert found["offset"] == pytest.approx(facts.offset * facts.signal, abs=0.005)

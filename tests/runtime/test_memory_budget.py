@@ -29,9 +29,9 @@ from lexsplat.runtime.errors import MemoryBudgetError
 pytestmark = pytest.mark.slow
 
 MEGABYTE = 1 << 20
-VIEWS, WIDTH, HEIGHT = 50, 960, 720
+VIEWS, WIDTH, HEIGHT = 38, 960, 720
 MEMORY = 80 * MEGABYTE
-BESIDE = 300 * MEGABYTE
+BESIDE = 220 * MEGABYTE
 """What one photo on its way, a few hundred Gaussians and threads may take beside the budget."""
 
 BUILD = """
@@ -88,7 +88,7 @@ def build(capture: Path, output: Path, *options: str) -> Program:
     arguments = [
         str(MEMORY + BESIDE), str(output),
         "build", str(capture), "--output", str(output), "--clip", "bundled", "--dino", "none", "--device", "cpu",
-        "--downscale", "1", "--iterations", "44", "--reconstruction.max-gaussians", "400",
+        "--downscale", "1", "--iterations", "34", "--reconstruction.max-gaussians", "400",
         "--reconstruction.warm-up", "0", "--codebook.num-codes", "8", "--codebook.steps", "20",
         "--trained.iterations", "10", "--trained.render-downscale", "4",
         "--features.crop-sizes", "0.5", "--features.crop-strides", "0.5", "--features.map-cells", "16",

@@ -1,11 +1,11 @@
 """Scene folder: whole files or none, stages that know what they were made from."""
 
 import json
-import multiprocessing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.forks import PROCESSES
 
 from lexsplat.geometry.cameras import look_at
 from lexsplat.runtime.errors import QueryError, SceneFolderError
@@ -63,9 +63,8 @@ def _hold(root: str, ready, release) -> None:
 
 @pytest.mark.slow
 def test_a_second_build_is_refused_with_the_process_of_the_first(tmp_path):
-    context = multiprocessing.get_context("spawn")
-    ready, release = context.Event(), context.Event()
-    process = context.Process(target=_hold, args=(str(tmp_path), ready, release))
+    ready, release = PROCESSES.Event(), PROCESSES.Event()
+    process = PROCESSES.Process(target=_hold, args=(str(tmp_path), ready, release))
     process.start()
     try:
         assert ready.wait(60)
@@ -79,7 +78,7 @@ def test_a_second_build_is_refused_with_the_process_of_the_first(tmp_path):
 
 
 def test_a_build_removes_only_temporary_files_of_dead_processes(tmp_path):
-    dead = multiprocessing.get_context("spawn").Process(target=int)
+    dead = PROCESSES.Process(target=int)
     dead.start()
     dead.join()
     folder = SceneFolder(tmp_path / "scene")

@@ -1,12 +1,12 @@
 """A library of scenes: it agrees with its scenes, keeps encoders apart, and is whole whatever happens to it."""
 
 import json
-import multiprocessing
 import shutil
 
 import numpy as np
 import pytest
 import torch
+from support.forks import PROCESSES
 from support.library_scenes import OTHERS, contents, hits, write_scene
 
 import lexsplat
@@ -406,9 +406,8 @@ def _hold(root, ready, release):
 
 @pytest.mark.slow
 def test_a_second_writer_is_refused_and_readers_are_not(rooms_copy):
-    context = multiprocessing.get_context("spawn")
-    ready, release = context.Event(), context.Event()
-    process = context.Process(target=_hold, args=(rooms_copy / "library", ready, release))
+    ready, release = PROCESSES.Event(), PROCESSES.Event()
+    process = PROCESSES.Process(target=_hold, args=(rooms_copy / "library", ready, release))
     process.start()
     try:
         assert ready.wait(120)

@@ -1,10 +1,14 @@
-"""Forks that are killed after a while, for tests that nothing is lost."""
+"""Forks, some of which are killed after a while, for tests that nothing is lost."""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import time
+
+PROCESSES = multiprocessing.get_context("fork" if hasattr(os, "fork") else "spawn")
+"""Another process; a fork, where there is one, has nothing to import."""
 
 
 def outcome(child: int, seconds: float | None) -> str:
