@@ -109,7 +109,9 @@ def test_a_rebuild_keeps_up_and_scale_while_the_cameras_are_unchanged(tiny_captu
     assert stored(tmp_path)["up"]["direction"] == pytest.approx([0, 0.6, 0.8])
     store_world(SceneFolder.open(tmp_path), meters_per_unit=0.5, measured="height")
     assert run(*build, "--up", "0,0,2") == 0
-    assert "the scale was measured as a height along another up direction, (0.000, 0.600, 0.800)" in caplog.text
+    assert (
+        "the scale was measured as a height along another up direction, (0.000, 0.600, 0.800)" in caplog.text
+    )
     assert stored(tmp_path)["up"] == {"direction": [0, 0, 1], "reliable": True, "from": "user"}
     assert stored(tmp_path)["meters_per_unit"] == 0.5
     record = json.loads((tmp_path / "scene.json").read_text())
