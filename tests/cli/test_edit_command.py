@@ -14,6 +14,7 @@ from lexsplat.cli.waiting import LateProgress
 from lexsplat.queries.visibility import whole_things
 from lexsplat.scenes import editing
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
+from lexsplat.scenes.scale import store_world
 from lexsplat.scenes.unsaved import unsaved_steps
 
 
@@ -91,6 +92,24 @@ def test_the_journal_holds_the_motions_of_the_command_line(built, tmp_path, caps
     assert "2. duplicate blue ball" in capsys.readouterr().out
 
 
+def test_lengths_with_units_are_meters_where_the_scale_is_known_and_refused_elsewhere(
+    built, tmp_path, capsys
+):
+    copy = shutil.copytree(built, tmp_path / "scene")
+    thing = ("--select", "blue ball", "--threshold", "0.05")
+    command = ["edit", str(copy), "duplicate", *thing]
+    refused = "0.2 m: expected a scene with a known scale, found none; set it with: lexsplat scale"
+    fails_in_one_line(capsys, [*command, "--by", "20cm", "0", "0"], refused)
+    fails_in_one_line(capsys, [*command, "--by", "1", "0", "0", "--grow", "20cm"], refused)
+    assert not (copy / "edits.jsonl").exists(), "no step"
+    store_world(SceneFolder.open(copy), meters_per_unit=0.5)
+    assert cli.main([*command, "--by", "20cm", "0", "-10in"]) == 0
+    assert cli.main([*command, "--by", "20", "0", "-10", "--grow", "1m"]) == 0
+    _, by_meters, by_units = map(json.loads, (copy / "edits.jsonl").read_text().splitlines())
+    assert by_meters["translation"] == pytest.approx([0.4, 0.0, -0.508])
+    assert by_units["translation"] == [20.0, 0.0, -10.0], "plain numbers are scene units, as before"
+
+
 def test_steps_are_applied_within_a_stage_of_progress(built, tmp_path, monkeypatch):
     copy = tmp_path / "scene"
     shutil.copytree(built, copy)
@@ -121,6 +140,14 @@ def test_steps_are_applied_within_a_stage_of_progress(built, tmp_path, monkeypat
         (["duplicate", "--select", "red apple"], "duplicate needs --by, --turn or --scale"),
         (["move", "--select", "red apple", "--scale", "-1"], "scale must be positive"),
         (["move", "--select", "red apple", "--by", "nan", "0", "0"], "finite"),
+        (
+            ["move", "--select", "red apple", "--by", "20cm", "0.5", "0"],
+            "a unit with each length or with none",
+        ),
+        (
+            ["move", "--select", "red apple", "--by", "20ells", "0", "0"],
+            "expected a length such as 0.095 or 9.5cm",
+        ),
         (["recolor", "--select", "red apple", "--color", "2", "0", "0"], "in 0..1, got 2 0 0"),
         (["recolor", "--select", "red apple", "--color", "1", "0", "0", "--strength", "3"], "in 0..1, got 3"),
         (["delete", "--select", "red apple", "--threshold", "3"], "in 0..1"),

@@ -7,7 +7,7 @@ from support.language_scene import CENTERS, RADIUS, LanguageScene, make_scene
 
 from lexsplat.geometry.cameras import look_at
 from lexsplat.language.fields import CodeField
-from lexsplat.queries.picking import Hit, select_hit, similarity_to, surface_at
+from lexsplat.queries.picking import Hit, point_at, select_hit, similarity_to, surface_at
 from lexsplat.runtime.errors import QueryError
 
 
@@ -54,6 +54,19 @@ def test_similarity_is_the_cosine_of_features(balls, field):
     features = torch.nn.functional.normalize(balls.codebook.clip, dim=-1)[balls.labels]
     expected = (features @ features[balls.labels == 2][0]).clamp(0, 1)
     assert torch.allclose(similarity_to(click(balls, 2)[0], field), expected, atol=1e-5)
+
+
+def test_the_point_of_a_pixel_is_where_its_ray_meets_the_ball_and_none_beside_it(balls):
+    center = CENTERS[0]
+    camera = look_at(center - np.array([0.0, 4.0, 0.0]), center, np.array([0.0, 0.0, 1.0]), 80, 60, 0.6)
+    point = point_at(balls.gaussians, camera, 40.0, 30.0)
+    assert point == pytest.approx(center - np.array([0.0, RADIUS, 0.0]), abs=0.15)
+    pixels, _, _ = camera.project(point[None])
+    assert pixels[0] == pytest.approx([40.0, 30.0], abs=1e-6), "on the ray of the pixel"
+    sky = look_at([0.0, -6.0, 6.0], [0.0, 0.0, 8.0], np.array([0.0, 0, 1]), 40, 30, 0.5)
+    assert point_at(balls.gaussians, sky, 20.0, 15.0) is None
+    with pytest.raises(QueryError, match="outside"):
+        point_at(balls.gaussians, camera, 80.0, 30.0)
 
 
 def test_a_click_that_hits_nothing_is_refused(balls):

@@ -9,7 +9,9 @@ from support.command_line import fails_in_one_line
 
 from lexsplat import cli, open_scene
 from lexsplat.geometry.boxes import gravity_up
+from lexsplat.geometry.world import World
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
+from lexsplat.scenes.scale import store_world
 
 
 @pytest.fixture
@@ -105,7 +107,11 @@ def test_a_rebuild_keeps_up_and_scale_while_the_cameras_are_unchanged(tiny_captu
     assert run(*build) == 0
     assert stored(tmp_path)["meters_per_unit"] == 0.5
     assert stored(tmp_path)["up"]["direction"] == pytest.approx([0, 0.6, 0.8])
+    store_world(SceneFolder.open(tmp_path), meters_per_unit=0.5, measured="height")
     assert run(*build, "--up", "0,0,2") == 0
+    assert (
+        "the scale was measured as a height along another up direction, (0.000, 0.600, 0.800)" in caplog.text
+    )
     assert stored(tmp_path)["up"] == {"direction": [0, 0, 1], "reliable": True, "from": "user"}
     assert stored(tmp_path)["meters_per_unit"] == 0.5
     record = json.loads((tmp_path / "scene.json").read_text())
@@ -157,3 +163,86 @@ def test_a_vector_that_is_none_is_refused_with_the_name_of_its_option(old_demo_c
         run("scale", old_demo_copy, *given)
     said = " ".join(capsys.readouterr().err.replace("│", " ").split())
     assert f"{option}: expected three numbers such as 0,0,1, found '0,0'" in said
+
+
+@pytest.fixture
+def scaled_by_a_height(old_demo_copy):
+    """A scale from a height along (0, 1, 0), as --height-of stores it."""
+    store_world(SceneFolder.open(old_demo_copy), up=(0, 1, 0), meters_per_unit=0.5, measured="height")
+    return old_demo_copy
+
+
+def test_an_up_direction_that_contradicts_the_cameras_is_set_with_a_warning(old_demo_copy, caplog):
+    assert run("scale", old_demo_copy, "--up", "0,1,0") == 0
+    assert (
+        "up is 90 degrees from what the cameras agree on; if that is wrong, give: --up=0,0,1" in caplog.text
+    )
+    assert stored(old_demo_copy)["up"]["direction"] == [0, 1, 0]
+    caplog.clear()
+    assert run("scale", old_demo_copy, "--up", "0,0.1,1") == 0
+    assert caplog.messages == [], "a small correction is what the option is for"
+
+
+def test_cameras_that_do_not_agree_contradict_no_up_direction(old_demo_copy, monkeypatch, caplog):
+    unsure = World.of_cameras(())
+    assert not unsure.up.reliable
+    monkeypatch.setattr(World, "of_cameras", lambda cameras: unsure)
+    assert run("scale", old_demo_copy, "--up", "0,1,0") == 0
+    assert caplog.messages == []
+
+
+def test_a_scale_that_was_a_height_along_another_up_direction_is_noted_when_up_is_set(
+    scaled_by_a_height, caplog
+):
+    caplog.clear()
+    assert run("scale", scaled_by_a_height, "--up", "0,0,1") == 0
+    (told,) = caplog.messages
+    assert "measured as a height along another up direction, (0.000, 1.000, 0.000); measure again: " in told
+    assert stored(scaled_by_a_height)["meters_per_unit"] == 0.5
+    caplog.clear()
+    assert run("scale", scaled_by_a_height, "--distance", 0.5, "--points", "0,0,0", "1,0,0") == 0
+    assert run("scale", scaled_by_a_height, "--up", "0,0.1,1") == 0
+    assert caplog.messages == [], "a distance between two points has no direction"
+
+
+def test_a_scale_of_an_earlier_version_may_have_been_a_height(scaled_by_a_height, caplog):
+    record = json.loads((scaled_by_a_height / "scene.json").read_text())
+    record["world"].pop("measured")
+    (scaled_by_a_height / "scene.json").write_text(json.dumps(record))
+    caplog.clear()
+    assert run("scale", scaled_by_a_height, "--up", "0,0,1") == 0
+    (told,) = caplog.messages
+    assert told.startswith("if the scale was measured as a height, that was along another up direction")
+    caplog.clear()
+    assert run("scale", scaled_by_a_height, "--up", "0,0,1") == 0
+    assert caplog.messages == [], "nothing has changed"
+
+
+def test_a_height_is_measured_along_the_up_direction_of_the_same_command(old_demo_copy, monkeypatch):
+    directions = []
+
+    def height_of(scene, phrase):
+        directions.append((phrase, scene.world.up.direction.tolist()))
+        return 2.0
+
+    monkeypatch.setattr("lexsplat.scenes.scale.height_of", height_of)
+    assert run("scale", old_demo_copy, "--up", "0,1,0", "--distance", "1m", "--height-of", "mug") == 0
+    assert directions == [("mug", [0.0, 1.0, 0.0])]
+    assert stored(old_demo_copy)["measured"] == {"as": "height", "up": [0.0, 1.0, 0.0]}
+    assert stored(old_demo_copy)["meters_per_unit"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("meters", "absurd"), [("1", False), ("1km", True), ("0.1mm", True)], ids=["rooms", "cities", "grains"]
+)
+def test_the_meters_that_the_cameras_span_are_printed_with_a_warning_where_they_are_absurd(
+    old_demo_copy, capsys, caplog, meters, absurd
+):
+    cameras = [view.camera for view in SceneFolder.open(old_demo_copy).read_cameras().values()]
+    places = np.array([-camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3] for camera in cameras])
+    span = np.sqrt(((places.max(0) - places.min(0)) ** 2).sum())
+    assert run("scale", old_demo_copy, "--distance", meters, "--points", "0,0,0", "1,0,0") == 0
+    out = capsys.readouterr().out
+    if not absurd:
+        assert f"one unit is 1 m; the {len(cameras)} cameras span {span:.2g} m" in out
+    assert ("check the distance, its unit" in caplog.text) == absurd

@@ -9,9 +9,11 @@ from support.viewer_scene import BallScene, ball_scene
 
 import lexsplat
 from lexsplat.codebook import Codebook
+from lexsplat.geometry.cameras import look_at
 from lexsplat.language.segments import Segments
 from lexsplat.queries import thresholds as threshold_rule
 from lexsplat.queries.everyday import EverydayScale
+from lexsplat.queries.picking import surface_at
 from lexsplat.queries.relevancy import QueryConfig, gaussian_relevancy, render_relevancy
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.scenes import answers as answers_module
@@ -130,6 +132,20 @@ def test_a_view_is_named_with_or_without_suffix_or_given_as_a_camera(scene):
         assert torch.equal(scene.relevancy(BALLS, view), expected)
         assert scene.render(view).image.shape == (72, 96, 3)
         assert scene.find("ball 0 left of ball 1", view) is not None
+
+
+def test_the_point_of_a_pixel_is_that_of_a_click_there_and_none_in_the_sky(scene):
+    camera = scene.camera("view2")
+    x, y = camera.project(scene.select("ball 0").center[None])[0][0]
+    assert scene.point("view2", x, y) == pytest.approx(surface_at(scene.gaussians, camera, x, y).point)
+    apart = min(
+        np.linalg.norm(scene.point("view2.jpg", x, y) - thing.center) for thing in map(scene.select, BALLS)
+    )
+    assert apart < 1
+    sky = look_at([0.0, -6.0, 6.0], [0.0, 0.0, 8.0], np.array([0.0, 0, 1]), 40, 30, 0.5)
+    assert scene.point(sky, 20.0, 15.0) is None
+    with pytest.raises(QueryError, match="outside"):
+        scene.point("view2", -1.0, 0.0)
 
 
 @pytest.mark.parametrize("wrong", ["nowhere", 3, None, ("view2",)])

@@ -13,7 +13,7 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from lexsplat.cli.options import PRESENCE, Device, SceneArgument, check_threshold, confirmed, open_scene
-from lexsplat.cli.values import Color
+from lexsplat.cli.values import Color, Lengths, Reach, Shift
 from lexsplat.cli.waiting import starting
 from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.progress import uncounted
@@ -26,6 +26,7 @@ ACTIONS = (*CHANGES, "undo", "redo", "list", "discard", "save")
 _CHOICE = ("select", "view", "threshold", "grow", "shrink", "largest")
 """Options that say what to change."""
 _MOTION = ("by", "turn", "scale")
+_STAYS = Lengths((0.0, 0.0, 0.0))
 _OPTIONS = {
     "delete": ("fill",),
     "recolor": ("color", "strength"),
@@ -68,14 +69,15 @@ class Edit:
         select: Phrase for the things to change; it may relate things (see lexsplat find --help).
         view: Name of the view that left and right refer to.
         threshold: Relevancy from which a Gaussian is selected.
-        grow: Widen the selection by this distance in units of the scene.
-        shrink: Narrow the selection by this distance in units of the scene.
+        grow: Widen the selection by this distance, in units of the scene or with a unit, such as 5cm.
+        shrink: Narrow the selection by this distance, in units of the scene or with a unit.
         largest: Change only the largest of the things found.
         fill: Close the surface under a thing that is deleted or moved, which no photo shows: the pattern around it
             goes on; --no-fill leaves the hole.
         color: New color for recolor: three numbers in 0..1, "#ff8800" or a name such as orange.
         strength: Share of the new color, in 0..1.
-        by: Shift in units of the scene, for move and duplicate.
+        by: Shift along the axes of the scene, for move and duplicate: in units of the scene, or with units, such as
+            20cm 0 0, once the scale is known (see lexsplat scale).
         turn: Degrees about the up direction, counterclockwise from above.
         scale: Factor on the size; the bottom stays at its height.
         output: The new scene folder, for save.
@@ -89,13 +91,13 @@ class Edit:
     select: str | None = None
     view: str | None = None
     threshold: float | None = None
-    grow: float | None = None
-    shrink: float | None = None
+    grow: Reach = None
+    shrink: Reach = None
     largest: bool = False
     fill: bool = True
     color: Color = None
     strength: float = 1.0
-    by: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    by: Shift = _STAYS
     turn: float = 0.0
     scale: float = 1.0
     output: Path | None = None
@@ -113,7 +115,7 @@ class Edit:
             raise ValueError(f"{self.action} needs --select PHRASE")
         if self.action in needs and getattr(self, needs[self.action]) is None:
             raise ValueError(f"{self.action} needs --{needs[self.action]}")
-        if self.action in ("move", "duplicate") and not any((*self.by, self.turn, self.scale - 1)):
+        if self.action in ("move", "duplicate") and not any((*self.by.values, self.turn, self.scale - 1)):
             raise ValueError(f"{self.action} needs --by, --turn or --scale")
         check_threshold(self.threshold)
         self._check_meaning()
@@ -128,7 +130,7 @@ class Edit:
                 raise ValueError(f"{self.action} takes no --{negation}{option.name}")
 
     def _check_numbers(self) -> None:
-        if not all(map(math.isfinite, (*self.by, self.turn, self.scale))):
+        if not all(map(math.isfinite, (*self.by.values, self.turn, self.scale))):
             raise ValueError("--by, --turn and --scale must be finite")
         if self.scale <= 0:
             raise ValueError(f"scale must be positive, got {self.scale:g}")
@@ -137,8 +139,8 @@ class Edit:
                 found = " ".join(f"{value:g}" for value in values)
                 raise ValueError(f"--{name} must be in 0..1, got {found}")
         for name, value in (("grow", self.grow), ("shrink", self.shrink)):
-            if value is not None and not 0 <= value < math.inf:
-                raise ValueError(f"--{name} must not be negative or infinite, got {value:g}")
+            if value is not None and not 0 <= value.values[0] < math.inf:
+                raise ValueError(f"--{name} must not be negative or infinite, got {value.values[0]:g}")
 
     def run(self) -> None:
         """Do one action and print the steps and the size of the edited scene."""
@@ -186,11 +188,13 @@ class Edit:
     def _change(self, editor: Editor) -> None:
         from lexsplat.scenes.editing import Motion
 
+        world = editor.scene.world
+        by, grow, shrink = (each and each.units(world) for each in (self.by, self.grow, self.shrink))
         chosen = editor.scene.find(self.select or "", self.view, threshold=self.threshold)
         chosen = chosen.largest() if self.largest else chosen
-        chosen = chosen.grow(self.grow) if self.grow is not None else chosen
-        chosen = chosen.shrink(self.shrink) if self.shrink is not None else chosen
-        motion = Motion(self.by, scale=self.scale, turn=self.turn)
+        chosen = chosen.grow(*grow) if grow else chosen
+        chosen = chosen.shrink(*shrink) if shrink else chosen
+        motion = Motion(by or (0, 0, 0), scale=self.scale, turn=self.turn)
         with uncounted(editor.original.listener, "steps"):
             editor.change(self.action, chosen, motion, self.color or (), self.strength, self.fill)
         if chosen.present == "unsure" or chosen.note:

@@ -5,9 +5,11 @@ given; the scale is known once a distance in the scene has been given (``lexspla
 ``scene.json`` as ``world``::
 
     {"up": {"direction": [x, y, z], "reliable": true, "from": "cameras" | "splats" | "user"},
-     "meters_per_unit": 0.41 | null, "poses": "..."}
+     "meters_per_unit": 0.41 | null,
+     "measured": {"as": "height" | "distance", "up": [x, y, z]} | null, "poses": "..."}
 
-"poses" is a fingerprint of the camera poses; stored values are valid only for these poses.
+"measured" is how the scale was measured, and the up direction at that time, along which a height is one. "poses" is a
+fingerprint of the camera poses; stored values are valid only for these poses.
 """
 
 from __future__ import annotations
@@ -15,9 +17,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lexsplat.geometry.boxes import Up, gravity_up
 from lexsplat.geometry.cameras import Camera
@@ -25,6 +28,23 @@ from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.runtime.fingerprints import digest
 
 Source = Literal["cameras", "splats", "user"]
+Measure = Literal["height", "distance"]
+
+
+class Measured(NamedTuple):
+    """How the scale of a scene was measured.
+
+    Args:
+        kind: From a height, which depends on the up direction, or from a distance between two places.
+        up: Up direction at that time ``[3]``, of unit length.
+    """
+
+    kind: Measure
+    up: tuple[float, ...]
+
+    def tilt(self, up: Up) -> float:
+        """Angle between the up direction of the measurement and another one, in degrees."""
+        return angle_between(np.array(self.up), up.direction)
 
 
 @dataclass(frozen=True)
@@ -35,6 +55,7 @@ class World:
         up: The direction away from the ground.
         source: Origin of the up direction: the cameras, the splats that came without cameras, or the user.
         meters_per_unit: Length of a world unit in meters; None if unknown.
+        measured: How the scale was measured; None if it is unknown, or was stored by an earlier version.
 
     Raises:
         ValueError: If the scale is not positive and finite.
@@ -43,6 +64,7 @@ class World:
     up: Up
     source: Source = "cameras"
     meters_per_unit: float | None = None
+    measured: Measured | None = None
 
     def __post_init__(self) -> None:
         scale = self.meters_per_unit
@@ -106,7 +128,10 @@ class World:
             source: Source = up["from"] if up["from"] in ("splats", "user") else "cameras"
             world = cls(Up(np.array([0.0, 0.0, 1.0]), False)).with_up(float(v) for v in up["direction"])
             world = replace(world, up=replace(world.up, reliable=bool(up["reliable"])), source=source)
-            return replace(world, meters_per_unit=None if scale is None else float(scale))
+            known = content.get("measured")
+            measured = None if known is None else _measured(known)
+            scale = None if scale is None else float(scale)
+            return replace(world, meters_per_unit=scale, measured=measured)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise SceneFolderError(
                 "world in scene.json",
@@ -114,6 +139,16 @@ class World:
                 found=str(error),
                 remedy="take it out of the file, or run: lexsplat build again",
             ) from error
+
+
+def _measured(content: Mapping[str, Any]) -> Measured:
+    kind: Measure = "height" if content["as"] == "height" else "distance"
+    return Measured(kind, tuple(World.of_cameras(()).with_up(content["up"]).up.direction.tolist()))
+
+
+def angle_between(first: NDArray, second: NDArray) -> float:
+    """Angle between two directions ``[3]`` of unit length, in degrees."""
+    return math.degrees(math.atan2(float(np.linalg.norm(np.cross(first, second))), float(first @ second)))
 
 
 def world_of(record: Mapping[str, Any], cameras: Mapping[str, Camera]) -> World:
@@ -134,7 +169,9 @@ def world_of(record: Mapping[str, Any], cameras: Mapping[str, Camera]) -> World:
 
 def stored_world(world: World, cameras: Mapping[str, Camera]) -> dict[str, Any]:
     """The entry ``world`` of ``scene.json``; `world_of` reads it."""
-    return {**world.to_json(), "poses": _poses_of(cameras)}
+    measured = world.measured
+    how = None if measured is None else {"as": measured.kind, "up": [round(v, 6) + 0.0 for v in measured.up]}
+    return {**world.to_json(), "measured": how, "poses": _poses_of(cameras)}
 
 
 def _poses_of(cameras: Mapping[str, Camera]) -> str:

@@ -25,6 +25,7 @@ from lexsplat.runtime.fingerprints import file_hash, fingerprint
 from lexsplat.scenes.facts import is_of_chosen_views
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.previous import keep_previous
+from lexsplat.scenes.scale import warn_of_stale_scale
 from lexsplat.scenes.views import PhotoLens
 
 log = logging.getLogger("lexsplat")
@@ -90,9 +91,10 @@ def _write_world(folder: SceneFolder, up: str | None, cameras: dict[str, Camera]
     direction even if it is a guess. A scale stored for other cameras is dropped.
     """
     record = folder.record
-    world = world_of(record, cameras)
+    world = known = world_of(record, cameras)
     if up is not None:
         world = world.with_up(parse_vector(up))
+        warn_of_stale_scale(known, world)
     elif world.source != "user" and is_of_chosen_views(record):
         found = record["stages"]["views"]["up"]
         world = replace(world, up=Up(np.array(found["direction"]), found["reliable"]), source="splats")

@@ -45,7 +45,6 @@ class Hit:
     weights: Tensor
 
 
-@torch.no_grad()
 def surface_at(gaussians: Gaussians, camera: Camera, x: float, y: float) -> Hit:
     """The surface at a pixel: the depth behind which less than half of the transmittance is left.
 
@@ -58,6 +57,30 @@ def surface_at(gaussians: Gaussians, camera: Camera, x: float, y: float) -> Hit:
     Raises:
         QueryError: If the pixel is not of two numbers, lies outside the image, or shows nothing.
     """
+    hit = _surface(gaussians, camera, x, y)
+    if hit is None:
+        raise QueryError(f"pixel ({x:g}, {y:g})", expected="a surface", found="nothing")
+    return hit
+
+
+def point_at(gaussians: Gaussians, camera: Camera, x: float, y: float) -> NDArray[np.float64] | None:
+    """Point where the ray of a pixel meets the surface of `surface_at` ``[3]``, world units; None without a surface.
+
+    Args:
+        gaussians: The scene.
+        camera: The view.
+        x: Pixels from the left; the first pixel's center is 0.5.
+        y: Pixels from the top.
+
+    Raises:
+        QueryError: If the pixel is not of two numbers or lies outside the image.
+    """
+    hit = _surface(gaussians, camera, x, y)
+    return None if hit is None else hit.point
+
+
+@torch.no_grad()
+def _surface(gaussians: Gaussians, camera: Camera, x: float, y: float) -> Hit | None:
     numbers = isinstance(x, Real) and isinstance(y, Real)
     if not (numbers and 0 <= x < camera.width and 0 <= y < camera.height):
         raise QueryError(
@@ -71,7 +94,7 @@ def surface_at(gaussians: Gaussians, camera: Camera, x: float, y: float) -> Hit:
     seen = (weights > 1e-4).nonzero()[:, 0]
     shares = weights[seen].double().cpu()
     if float(shares.sum()) < LEAST_SURFACE:
-        raise QueryError(f"pixel ({x:g}, {y:g})", expected="a surface", found="nothing")
+        return None
     means = gaussians.means[seen].double().cpu()
     depths = means @ torch.from_numpy(camera.viewmat[2, :3].copy()) + camera.viewmat[2, 3]
     order = depths.argsort()

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.features.hub import present_name
@@ -26,7 +28,7 @@ from lexsplat.geometry.world import World, world_of
 from lexsplat.language.fields import LanguageField
 from lexsplat.queries.everyday import EverydayScale, everyday_words
 from lexsplat.queries.phrases import Understood
-from lexsplat.queries.picking import Hit, select_hit, surface_at
+from lexsplat.queries.picking import Hit, point_at, select_hit, surface_at
 from lexsplat.queries.presence import PresenceClassifier
 from lexsplat.queries.relevancy import (
     QueryConfig,
@@ -35,10 +37,9 @@ from lexsplat.queries.relevancy import (
     check_phrase,
     check_prompts,
     embed_prompts,
-    gaussian_relevancy,
     render_relevancy,
 )
-from lexsplat.queries.scoring import form_used, render_gaussian_scores, scores_in_form
+from lexsplat.queries.scoring import form_used, render_gaussian_scores
 from lexsplat.queries.seen import Seen
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.thresholds import check_threshold
@@ -57,7 +58,7 @@ from lexsplat.scenes.kept import KeptObjects, kept_objects_of, seen_of
 from lexsplat.scenes.objects import objects_of
 from lexsplat.scenes.reading import read_scene
 from lexsplat.scenes.views import StoredView, view_named
-from lexsplat.scenes.words import Word, with_objects
+from lexsplat.scenes.words import Word, new_words
 
 _KEPT_BYTES = 128 << 20
 """Memory for the scores and selections of words that were asked, at most; 32 words are kept in any case."""
@@ -240,7 +241,7 @@ class Scene:
             things = (thing for thing in map(thing_of_part, new) if thing and words_of.get(thing) is None)
             new = list(dict.fromkeys([*things, *new]))
             with self._working:
-                found.update((p, words_of.put(p, word)) for p, word in zip(new, self._new_words(new)))
+                found.update((p, words_of.put(p, word)) for p, word in zip(new, new_words(self, new)))
         words = [word for prompt in prompts if (word := found[prompt]) is not None]
         presences = tuple(word.presence for word in words)
         if not checked:
@@ -350,6 +351,14 @@ class Scene:
         """
         return self.select_hit(surface_at(self.gaussians, self.camera(view), x, y))
 
+    def point(self, view: str | StoredView | Camera, x: float, y: float) -> NDArray[np.float64] | None:
+        """The point ``[3]`` on the surface at a pixel (as of `click`), world units; None where it shows nothing.
+
+        Raises:
+            QueryError: If the pixel lies outside the image or is not of two numbers, or the view is unknown.
+        """
+        return point_at(self.gaussians, self.camera(view), x, y)
+
     def select_hit(self, hit: Hit) -> Selection:
         """The object at a surface that was clicked."""
         return replace(select_hit(hit, self.gaussians, self.field, self.cameras, self.world), seen=self.seen)
@@ -376,16 +385,6 @@ class Scene:
     def hidden(self) -> Tensor:
         """Gaussians ``[N]`` bool that the views hardly show, as far as a scene with segments knows."""
         return torch.zeros_like(self.gaussians.opacity_logits).bool() if not self.seen else self.seen.hidden
-
-    def _new_words(self, prompts: list[str]) -> Iterator[Word]:
-        """Scores and presence of prompts that were not asked before, each when the former ones are known."""
-        question = self.question(prompts)
-        scores = gaussian_relevancy(self.field, question)
-        presences = self.presence_classifier.classify(prompts, question.positives, scores)
-        formed = scores_in_form(self.field, self.query, scores, presences)
-        # Copies: a row would keep the scores of all prompts asked with it.
-        words = [Word(row.clone(), own.clone(), here) for row, own, here in zip(formed, scores, presences)]
-        return (with_objects(self, prompt, word) for prompt, word in zip(prompts, words))
 
     # -- views
 

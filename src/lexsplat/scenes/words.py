@@ -6,7 +6,7 @@ A kind such as "toy" is its members (`lexsplat.queries.kinds`), a part is cut wi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -20,7 +20,8 @@ from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.part_names import DOUBTFUL, is_doubtful
 from lexsplat.queries.parts import FEWEST, HELD, part_scores, with_parts
 from lexsplat.queries.presence import FAINT
-from lexsplat.queries.scoring import form_used
+from lexsplat.queries.relevancy import gaussian_relevancy
+from lexsplat.queries.scoring import form_used, scores_in_form
 from lexsplat.queries.selection import Presence, Selection
 from lexsplat.queries.thresholds import BORDER
 from lexsplat.queries.vocabulary import STUFF, SURFACES, is_part_alone, part_named, thing_of_part
@@ -58,6 +59,17 @@ class Word:
     note: str = ""
     members: tuple[Selection, ...] = ()
     asked: str = ""
+
+
+def new_words(scene: Scene, prompts: list[str]) -> Iterator[Word]:
+    """Scores and presence of prompts that were not asked before, each when the former ones are known."""
+    question = scene.question(prompts)
+    scores = gaussian_relevancy(scene.field, question)
+    presences = scene.presence_classifier.classify(prompts, question.positives, scores)
+    formed = scores_in_form(scene.field, scene.query, scores, presences)
+    # Copies: a row would keep the scores of all prompts asked with it.
+    words = [Word(row.clone(), own.clone(), here) for row, own, here in zip(formed, scores, presences)]
+    return (with_objects(scene, prompt, word) for prompt, word in zip(prompts, words))
 
 
 def with_objects(scene: Scene, prompt: str, word: Word) -> Word:
