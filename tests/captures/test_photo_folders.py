@@ -138,6 +138,16 @@ def test_masks_that_leave_nothing_of_any_photo_are_refused(photos, tmp_path):
     assert not (tmp_path / "out" / "masks").exists()
 
 
+def test_the_mask_of_a_photo_without_a_pose_is_no_mistake(tmp_path):
+    write_transforms(tmp_path, ["a.png", "b.png"])
+    save(tmp_path / "images" / "unposed.png", np.zeros((48, 64, 3)))
+    save(tmp_path / "masks" / "unposed.png", np.ones((48, 64)))
+    assert load_capture(tmp_path).warnings == ()
+    save(tmp_path / "masks" / "nowhere.png", np.ones((48, 64)))
+    (warning,) = load_capture(tmp_path).warnings
+    assert warning.endswith("1 mask matches no photo and is ignored: nowhere.png")
+
+
 # -- copies
 
 
@@ -187,6 +197,16 @@ def test_the_mask_of_a_copy_is_no_mistake(photos, tmp_path):
     for name in ("1.png", "1 copy.png"):
         save(photos / "masks" / name, np.ones((30, 40, 3)))
     assert notes_of(photos, tmp_path, "no photo") == []
+
+
+def test_copies_among_photos_with_cameras_are_told(tmp_path):
+    write_transforms(tmp_path, ["a.png", "b.png", "c.png"])
+    assert load_capture(tmp_path).warnings == ()
+    (tmp_path / "images" / "b.png").write_bytes((tmp_path / "images" / "c.png").read_bytes())
+    capture = load_capture(tmp_path)
+    (warning,) = capture.warnings
+    assert "1 photo is an exact copy of another one, such as c.png, a copy of b.png" in warning
+    assert set(capture.views) == {"a.png", "b.png", "c.png"}, "each has a camera"
 
 
 # -- gray photos
