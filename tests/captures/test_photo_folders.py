@@ -1,5 +1,7 @@
 """What a folder of photos holds besides photos: hidden files, masks that are none, copies, and gray photos."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -21,7 +23,7 @@ APPLE_DOUBLE = b"\0\5\x16\7\0\2\0\0Mac OS X        "
 
 
 @pytest.fixture
-def photos(tmp_path):
+def photos(tmp_path: Path) -> Path:
     """Four color photos of noise, ``0.png`` to ``3.png``."""
     for index in range(4):
         save(tmp_path / "photos" / f"{index}.png", np.random.default_rng(index).random((30, 40, 3)))
