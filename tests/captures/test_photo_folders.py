@@ -1,5 +1,7 @@
 """What a folder of photos holds besides photos: hidden files, masks that are none, copies, and gray photos."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -21,7 +23,7 @@ APPLE_DOUBLE = b"\0\5\x16\7\0\2\0\0Mac OS X        "
 
 
 @pytest.fixture
-def photos(tmp_path):
+def photos(tmp_path: Path) -> Path:
     """Four color photos of noise, ``0.png`` to ``3.png``."""
     for index in range(4):
         save(tmp_path / "photos" / f"{index}.png", np.random.default_rng(index).random((30, 40, 3)))
@@ -138,6 +140,16 @@ def test_masks_that_leave_nothing_of_any_photo_are_refused(photos, tmp_path):
     assert not (tmp_path / "out" / "masks").exists()
 
 
+def test_the_mask_of_a_photo_without_a_pose_is_no_mistake(tmp_path):
+    write_transforms(tmp_path, ["a.png", "b.png"])
+    save(tmp_path / "images" / "unposed.png", np.zeros((48, 64, 3)))
+    save(tmp_path / "masks" / "unposed.png", np.ones((48, 64)))
+    assert load_capture(tmp_path).warnings == ()
+    save(tmp_path / "masks" / "nowhere.png", np.ones((48, 64)))
+    (warning,) = load_capture(tmp_path).warnings
+    assert warning.endswith("1 mask matches no photo and is ignored: nowhere.png")
+
+
 # -- copies
 
 
@@ -187,6 +199,16 @@ def test_the_mask_of_a_copy_is_no_mistake(photos, tmp_path):
     for name in ("1.png", "1 copy.png"):
         save(photos / "masks" / name, np.ones((30, 40, 3)))
     assert notes_of(photos, tmp_path, "no photo") == []
+
+
+def test_copies_among_photos_with_cameras_are_told(tmp_path):
+    write_transforms(tmp_path, ["a.png", "b.png", "c.png"])
+    assert load_capture(tmp_path).warnings == ()
+    (tmp_path / "images" / "b.png").write_bytes((tmp_path / "images" / "c.png").read_bytes())
+    capture = load_capture(tmp_path)
+    (warning,) = capture.warnings
+    assert "1 photo is an exact copy of another one, such as c.png, a copy of b.png" in warning
+    assert set(capture.views) == {"a.png", "b.png", "c.png"}, "each has a camera"
 
 
 # -- gray photos

@@ -1,6 +1,7 @@
 """Transparent pixels of photos are ignored, as masked ones are."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def save_rgba(path, pixels: np.ndarray, alpha: np.ndarray, **options) -> None:
 
 
 @pytest.fixture
-def capture_folder(tmp_path):
+def capture_folder(tmp_path: Path) -> Path:
     """A transforms.json with three photos, of which ``a.png`` is transparent outside the rectangle."""
     write_transforms(tmp_path, NAMES)
     save_rgba(tmp_path / "images" / "a.png", colors(), rectangle() * 255)
@@ -169,7 +170,7 @@ def test_what_was_made_before_transparency_counted_is_made_again(capture_folder)
 
 
 @pytest.fixture
-def photos(tmp_path):
+def photos(tmp_path: Path) -> Path:
     """Three photos, of which ``a.png`` is stored rotated and is transparent outside the rectangle."""
     folder = tmp_path / "photos"
     exif = Image.Exif()

@@ -9,7 +9,7 @@ from shlex import quote
 
 from lexsplat.captures.capture import Capture, View, stem_of
 from lexsplat.captures.ground_truth.layouts import annotated_names
-from lexsplat.captures.images.listing import is_image_file, some_of
+from lexsplat.captures.images.listing import images_below, is_image_file, some_of
 from lexsplat.captures.images.masks import (
     IGNORE_FOLDER,
     INVERTED,
@@ -23,6 +23,7 @@ from lexsplat.captures.readers.camera_files import CameraFiles, Photo
 from lexsplat.captures.readers.colmap import find_model, read_colmap
 from lexsplat.captures.readers.transforms_json import find_transforms, read_transforms
 from lexsplat.captures.readers.video import is_video, videos_in
+from lexsplat.captures.sfm.remarks import copies_of
 from lexsplat.captures.splits import choose_test_names
 from lexsplat.geometry.cameras import Camera
 from lexsplat.runtime.errors import CaptureError
@@ -60,15 +61,16 @@ def load_capture(
         raise ValueError(f"downscale must be positive, got {downscale:g}")
     files = _read_camera_files(Path(path), None if images is None else Path(images))
     warnings = [*files.warnings, *_missing_files(files)]
-    masked, strays = find_ignore_masks([files.root / IGNORE_FOLDER], [p.name for p in files.photos])
+    named = [photo.name for photo in files.photos]
+    masked, strays = find_ignore_masks([files.root / IGNORE_FOLDER], [*named, *_unposed(files)])
     # With estimated cameras, `prepare_photos` has reported them; masks of unregistered photos are no mistake.
     warnings += strays if beside is None else []
     views = {
         photo.name: _make_view(photo, files, downscale, masked.get(photo.name))
         for photo in sorted(files.photos, key=lambda photo: photo.name)
     }
-    warnings += [*_transparent(views, files.root), *_blank(views, files.root)]
-    _check_names([photo.name for photo in files.photos], files.origin)
+    warnings += [*_transparent(views, files.root), *_blank(views, files.root), *_copies(files)]
+    _check_names(named, files.origin)
     root = files.root if beside is None else Path(beside)
     chosen, split_warnings = choose_test_names(
         list(views),
@@ -91,6 +93,27 @@ def load_capture(
         warnings=tuple(warnings),
         background=files.background,
     )
+
+
+def _unposed(files: CameraFiles) -> list[str]:
+    """Names of the photos in ``images/`` without a camera, whose masks are no mistake."""
+    folder, posed = files.root / "images", {photo.path for photo in files.photos}
+    if not folder.is_dir():
+        return []
+    return [path.relative_to(folder).as_posix() for path in images_below(folder)[0] if path not in posed]
+
+
+def _copies(files: CameraFiles) -> list[str]:
+    """A warning on photos that are byte for byte the same, if there are any."""
+    copies = copies_of(Path(), [str(photo.path) for photo in files.photos])
+    if not copies:
+        return []
+    copy, photo = min(copies.items())
+    many = "1 photo is an exact copy" if len(copies) == 1 else f"{len(copies):,} photos are exact copies"
+    told = f"{many} of another one, such as {Path(copy).name}, a copy of {Path(photo).name}"
+    return [
+        f"{files.origin}: {told}; one may be held out while the other is trained: remove it from the cameras"
+    ]
 
 
 def _transparent(views: Mapping[str, View], root: Path) -> list[str]:
