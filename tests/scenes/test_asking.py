@@ -82,6 +82,15 @@ def test_statements_are_checked(demo, text, present, count):
     assert (answer["present"], answer["count"]) == (present, count)
 
 
+@pytest.mark.parametrize(
+    ("text", "start"),
+    [("Is there no violin?", 'It is so: no "violin".'), ("Is there no mug?", 'It is not so: no "mug".'),
+     ("at most two violins", 'It is so: at most 2 "violin".'), ("at most two mugs", "1 found for")],
+)  # fmt: skip
+def test_a_sentence_on_few_things_says_whether_it_is_so(demo, text, start):
+    assert sentence(find_phrase(demo, text)).startswith(start)
+
+
 def test_a_library_compares_the_words_that_a_scene_may_hold_instead():
     compared = spellings_of(understand("green leaves").phrase, "bundled")["green leaf"]
     assert {"green leaf", "green leaves", "leaves"} <= set(compared)
