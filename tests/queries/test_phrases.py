@@ -273,6 +273,7 @@ def test_names_of_things_keep_their_function_words(text):
     [
         ("the nose of the bear", "bear nose"), ("handle of the red mug", "red mug handle"),
         ("wheels of my toy car", "toy car wheels"), ("where is the shade of the table lamp?", "table lamp shade"),
+        ("leaves of the vase", "vase leaves"), ("how many leaves does the vase have?", "vase leaves"),
         ("the cup of tea", "cup of tea"), ("nose of clay", "nose of clay"),
     ],
 )  # fmt: skip

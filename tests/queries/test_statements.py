@@ -43,6 +43,7 @@ def shared(one, other):
         ("is the ring the closest thing to the mug", shared(Thing("ring"), Related("nearest to", ANY, MUG))),
         ("is the tallest object the lamp?", shared(Pick("tallest", ANY), LAMP)),
         ("is the duck a toy?", shared(DUCK, TOY)),
+        ("is the mug on the left a toy?", shared(Pick("leftmost", MUG), TOY)),
         ("isn't the duck a toy?", shared(DUCK, TOY)),
         ("is the duck not the largest toy?", Except(DUCK, Pick("largest", TOY))),
         ("is the duck closer than the mug?", shared(DUCK, Related("nearest to", Both(DUCK, MUG), ME))),
@@ -91,6 +92,7 @@ def test_an_article_behind_a_word_that_joins_makes_no_second_thing(text, same):
         ("is there nothing on the cloth?", AtLeast(0, Related("on", ANY, CLOTH), 0)),
         ("is there neither a mug nor a duck?", AtLeast(0, Both(MUG, DUCK), 0)),
         ("isn't there a mug?", MUG),
+        ("is there not a mug?", MUG),
     ],
 )
 def test_little_or_nothing_of_a_thing_is_understood(text, expected):

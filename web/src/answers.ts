@@ -89,5 +89,9 @@ export function spoken(answer: Answer): string {
   const count = answer.places?.length;
   const doubt = answer.presence === "unsure" ? "perhaps " : "";
   if (count === undefined) return `${doubt}here`;
+  if (count === 0 && answer.threshold === answer.automatic) {
+    if (answer.unknown && doubt) return "not understood";
+    if (/^\((?:no|at most) /.test(answer.phrase)) return "so it is: none here";
+  }
   return count === 0 ? "nothing above the threshold" : `${doubt}here, ${count === 1 ? "one place" : `${count} places`}`;
 }

@@ -104,7 +104,7 @@ export class Grammar {
     const described = this.match("describes", text);
     const verbs = described ? described[0].length : text.length;
     const shown = text.replace(new RegExp(this.#patterns.get("fixed")!, "gi"), (words) => ".".repeat(words.length));
-    const places = ["part_of", "unit", "numeral", "starts", ...(described ? [] : ["later", "article"])]
+    const places = ["part_of", "unit", "numeral", "does", "starts", ...(described ? [] : ["later", "article"])]
       .map((name) => this.find(name, shown))
       .filter((found) => found !== null)
       .map((found): [number, number] => [found.index, found.index + found[0].length]);

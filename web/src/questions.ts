@@ -34,7 +34,7 @@ export function understood(text: string, grammar: Grammar): Question {
   const plain = text.replaceAll("\0", "").replace(/"[^"]*"/g, () => `\0${number++}\0`).replace(/\s+/g, " ").trim();
   const asked = grammar.inFull(plain.replace(/[?.!\s]+$/, "") || plain);
   const yesOrNo = grammar.match("yes_or_no", asked) !== null;
-  const parser = new Parser(grammar, yesOrNo);
+  const parser = new Parser(grammar, yesOrNo, plain);
   const things = parser.whole(yesOrNo ? grammar.without("moment", asked) : asked);
   const shown = ({ text: hidden, color }: Thing): Thing => {
     const whole = hidden.replace(HIDDEN, (_, n: string) => quoted[Number(n)]).trim();
@@ -63,7 +63,8 @@ class Parser {
   #all = true;
   #parts = 0;
 
-  constructor(readonly grammar: Grammar, readonly yesOrNo: boolean) {}
+  /** `typed` is the text before it is put in other words. */
+  constructor(readonly grammar: Grammar, readonly yesOrNo: boolean, readonly typed: string) {}
 
   get together(): boolean {
     return this.yesOrNo && this.#all;
@@ -81,14 +82,26 @@ class Parser {
     if (every) this.#beyond(every[0].split(" ")[1]);
     const only = grammar.match("stated", asked) && grammar.find("only", asked);
     if (only) this.left = only[1];
-    const things = this.#phrase(which ? which.groups!.these : grammar.phrase(asked));
+    const things = (every ? null : this.#ofTwo(asked)) ?? this.#phrase(which ? which.groups!.these : grammar.phrase(asked));
     for (const { text } of things) this.left ||= grammar.leftOver(text.replace(HIDDEN, "thing"));
     if (this.left) this.beyond = ""; // its parts are no things
     return things;
   }
 
+  /** Words that ask for more than things, as they were typed: "at most 0" is made of "is there no". */
   #beyond(words: string): void {
-    this.beyond ||= words.replace(HIDDEN, "").trim();
+    const said = words.replace(HIDDEN, "").trim();
+    const isTyped = this.typed.toLowerCase().includes(said.toLowerCase());
+    this.beyond ||= isTyped ? said : (/\b(?:neither|nothing|no|not|any|or (?:fewer|less))\b/i.exec(this.typed)?.[0] ?? said);
+  }
+
+  /** "Is A the B?" and "is A closer than B?"; null for another question. */
+  #ofTwo(asked: string): Thing[] | null {
+    const { grammar } = this;
+    const closer = grammar.match("closer", asked)?.groups;
+    if (closer) return this.#of(/\b(?:closer|nearer|farther|further)\b/i.exec(asked)![0], closer.one, closer.other, closer.to);
+    const is = grammar.match("identity", asked)?.groups;
+    return is && grammar.undetermined(`${is.one} `).trim() ? this.#of(is.other, is.one, is.other) : null;
   }
 
   #phrase(given: string): Thing[] {
@@ -104,6 +117,10 @@ class Parser {
       this.#beyond("not");
       return this.#phrase(words.slice(not[0].length));
     }
+    const none = grammar.match("none_of", words);
+    if (none) return this.#of(none[0], words.slice(none[0].length));
+    const neither = grammar.match("neither", words)?.groups;
+    if (neither) return this.#neither(neither);
     words = words.replace(/\s*,\s*(?=(?:that|which|who)\s)/gi, " ");
     const between = grammar.match("between", ` ${words}`);
     if (between) {
@@ -137,6 +154,13 @@ class Parser {
     const last = words.toLowerCase().split(" ").at(-1)!;
     const known = singulars(last).some((form) => this.grammar.has("names", form) || this.grammar.has("kinds", form));
     return !this.grammar.has("qualities", last) && (known || /[^sui]s$/.test(last));
+  }
+
+  /** "Toys that are neither red nor blue", "neither the mug nor the duck". */
+  #neither({ noun, one, other }: Record<string, string | undefined>): Thing[] {
+    const bare = this.grammar.undetermined(noun ?? "");
+    const parts = [one, other].map((part) => (bare ? `${bare} that is ${part}` : part));
+    return this.#of("neither", bare, ...parts);
   }
 
   #difference(words: string): Thing[] | null {
@@ -180,6 +204,8 @@ class Parser {
       this.#beyond(ofTwo.groups!.more);
       return this.#phrase(words.slice(ofTwo[0].length) || "thing");
     }
+    const most = grammar.match("at_most", words);
+    if (most) return this.#of(most[0], words.slice(most[0].length));
     const theOne = grammar.match("the_one", words);
     let bare = theOne ? `thing ${words.slice(theOne[0].length)}` : words;
     for (let before = ""; before !== bare; ) {

@@ -4,6 +4,8 @@ import { singulars } from "./dictionary";
 
 const SAME_FORM = new Set(["stairs", "scissors", "trousers", "clothes", "pants"]);
 const HASHES = 5;
+/** Letters of a part of a compound word, at least. */
+const SHORTEST = 3;
 /** What a phrase with several typing errors may mean, at most. */
 const MOST = 4;
 
@@ -76,6 +78,19 @@ export class Spelling {
     const near = [...this.#known].filter((entry) => entry.length > 2 && isOneEdit(entry, word));
     return near.sort((a, b) => key(a) - key(b) || (a < b ? -1 : 1));
   }
+}
+
+/** A text with a compound word as two known words, with the last of them, or with two words as a known one. */
+export function compounds(text: string, isKnown: (word: string) => boolean): { words: string; head: string }[] {
+  const typed = text.split(" ");
+  return typed.flatMap((word, place) => {
+    const [before, after] = [typed.slice(0, place), typed.slice(place + 1)];
+    const ends = [...word].map((_, end) => end).filter((end) => end >= SHORTEST && end <= word.length - SHORTEST);
+    const split = ends.map((end) => [word.slice(0, end), word.slice(end)]).filter((pair) => pair.every(isKnown));
+    const found = split.map((pair) => ({ words: [...before, ...pair, ...after].join(" "), head: pair[1] }));
+    const joined = after.length ? word + after[0] : "";
+    return isKnown(joined) ? [...found, { words: [...before, joined, ...after.slice(1)].join(" "), head: "" }] : found;
+  });
 }
 
 /** Whether an English word may be a typing error of another one: a doubled letter, swapped neighbors, the last of six letters. */

@@ -10,7 +10,7 @@ import { type Question, type Thing, understood } from "./questions";
 import { type Presence, hasColor, isDoubtful, isPart, isPartAlone, peakOf, presenceOf, strengthsOf, thingOfPart } from "./rules";
 import type { Kinds } from "./kinds";
 import type { Segments } from "./segments";
-import type { Spelling } from "./spelling";
+import { type Spelling, compounds } from "./spelling";
 import type { Stage } from "./stage";
 import type { Description } from "./tower";
 import type { TowerLoader } from "./tower-loader";
@@ -53,7 +53,7 @@ export class Tables implements Source {
     if (beyond) return this.#beyond(question, prompt, color);
     if (left || things.length === 0) {
       const quoted = ` (“${left || prompt.trim()}”)`;
-      return doubtful(await this.#plain(plainly(prompt) || prompt.trim(), prompt, color), `not understood${quoted}: asked for as one thing, in these words`);
+      return unread(await this.#plain(plainly(prompt) || prompt.trim(), prompt, color), `not understood${quoted}: asked for as one thing, in these words`);
     }
     const answers: Answer[] = [];
     for (const thing of things) {
@@ -105,17 +105,35 @@ export class Tables implements Source {
 
   /** The answer to a thing, its typing errors mended. */
   async #mended(text: string, prompt: string, color: string): Promise<Answer | null> {
-    if (!this.spelling || this.dictionary.find(text) >= 0) return this.#asked(text, prompt, color);
+    if (!this.spelling) return this.#asked(text, prompt, color);
     const phrase = plainly(text);
+    if (this.dictionary.find(text) >= 0) return this.#asked(text, prompt, color).then((answer) => this.#inOtherWords(answer, phrase, prompt, color));
     for (const { phrase: meant, note } of this.spelling.meant(phrase)) {
       const answer = await this.#asked(meant, prompt, color);
       if (answer && answer.presence !== "no") return { ...answer, note };
     }
     const answer = await this.#asked(text, prompt, color);
+    const other = await this.#inOtherWords(answer, phrase, prompt, color);
+    if (other !== answer) return other;
     const strange = this.englishOnly ? this.spelling.strange(phrase) : [];
     if (strange.length === 0) return answer;
     const listed = strange.slice(0, 3).map((word) => `“${word.slice(0, 40)}”`).join(", ");
     return doubtful(answer, `the bundled encoder knows English words alone, not ${listed}`);
+  }
+
+  /** What is not here, with a compound word split or joined where the scene holds that (lexsplat.queries.meaning). */
+  async #inOtherWords(answer: Answer | null, text: string, prompt: string, color: string): Promise<Answer | null> {
+    if (answer?.presence !== "no") return answer;
+    const phrase = this.spelling?.singular(text) ?? text;
+    const isHere = async (words: string): Promise<Answer | null> => {
+      const found = await this.#plain(words, prompt, color, true);
+      return found?.presence === "yes" ? found : null;
+    };
+    for (const { words, head } of compounds(phrase, (word) => this.dictionary.grammar.has("in_compounds", word))) {
+      const found = await isHere(words);
+      if (found && (!head || (await isHere(head)))) return { ...found, note: [found.note, `“${phrase}” is asked for as “${words}”`].filter(Boolean).join("; ") };
+    }
+    return answer;
   }
 
   /** The answer to a text, for what was typed. */
@@ -123,22 +141,26 @@ export class Tables implements Source {
     // As in Python, words behind "something" stay as they are: something with leaves.
     const kept = this.dictionary.find(text) >= 0 || text.startsWith("something ");
     const thing = kept ? text : (this.spelling?.singular(plainly(text)) ?? text);
-    const plain = await this.#plain(thing, prompt, color);
+    const first = await this.#plain(thing, prompt, color);
+    const isPlural = first?.presence === "no" && first.phrase.toLowerCase() !== plainly(text);
+    const own = isPlural ? await this.#plain(plainly(text), prompt, color, true) : null;
+    const plain = own?.presence === "yes" ? own : first;
     const kind = plain && singulars(plainly(text)).find((form) => this.kinds.has(form));
     const members = kind ? this.kinds.find(kind, "", plain.scores) : null;
     return members ? { ...plain!, phrase: kind!, ...members } : plain;
   }
 
   /** The answer to a phrase by its own relevancy, or by the pixels of things of its name if it tells a color that language does not find. */
-  async #plain(text: string, prompt: string, color: string): Promise<Answer | null> {
-    const plain = await this.#byLanguage(text, prompt, color);
+  async #plain(text: string, prompt: string, color: string, isOwn = false): Promise<Answer | null> {
+    const plain = await this.#byLanguage(text, prompt, color, isOwn);
     const told = plain && plain.presence !== "yes" && this.segments ? this.#colorsTold(plain.phrase) : [];
     const inColor = told.length ? this.kinds.inColors(plain!.phrase.toLowerCase().split(" ").at(-1)!, told, plain!.scores) : null;
     return inColor ? { ...plain!, ...inColor } : plain;
   }
 
-  async #byLanguage(text: string, prompt: string, color: string): Promise<Answer | null> {
-    const known = this.dictionary.find(text);
+  /** `isOwn` words are not asked for in the singular. */
+  async #byLanguage(text: string, prompt: string, color: string, isOwn: boolean): Promise<Answer | null> {
+    const known = isOwn && !this.dictionary.has(text) ? -1 : this.dictionary.find(text);
     if (known >= 0) {
       const own = this.language.scores(this.dictionary.table(known));
       const presence = this.dictionary.presence(known);
@@ -291,6 +313,13 @@ function doubtful<T extends Answer | null>(answer: T, note: string): T {
   if (!answer) return answer;
   const presence = answer.presence === "yes" ? "unsure" : answer.presence;
   return { ...answer, note: [answer.note, note].filter(Boolean).join("; "), unknown: true, presence };
+}
+
+/** The answer to words without grammar: "unsure" in any case, and nothing where they are not here either. */
+function unread(answer: Answer | null, note: string): Answer | null {
+  const told = doubtful(answer, note);
+  if (told?.presence !== "no") return told;
+  return { ...told, presence: "unsure", scores: new Float32Array(told.scores.length), own: null, places: [], members: null };
 }
 
 /** Places without those that are mostly in an earlier one. */

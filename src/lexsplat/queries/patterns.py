@@ -168,10 +168,11 @@ CLOSER = re.compile(
 _FUNCTION_WORDS = """
     of to from for with about off out up down over in on like without plus minus except twice quite such really
 """
-_NO_NOUN = "|".join(sorted(CLOSED.union(_FUNCTION_WORDS.split())))
+_SIDES = ("left", "right", "middle", "center", "centre", "background", "foreground")
+_NO_NOUN = "|".join(sorted(CLOSED.union(_FUNCTION_WORDS.split()).difference(_SIDES)))
 IDENTITY = re.compile(
-    rf"^(?:is|are|was|were) (?!there\b)(?P<one>(?:\S+ )*?(?!(?:{_NO_NOUN}|(?<!the )(?<!a )(?<!my )\w+ing) )"
-    r"\S+) "
+    rf"^(?:is|are|was|were) (?!there\b)(?P<one>(?:\S+ )*?(?!(?:{_NO_NOUN}|"
+    rf"(?<!the )(?<!a )(?<!my )(?:\w+ing|{'|'.join(_SIDES)})) )\S+) "
     r"(?P<not>not )?(?P<other>(?:the|an?) (?:.*\S))$",
     re.IGNORECASE,
 )

@@ -33,8 +33,9 @@ _FIXED = (
 )
 """Parts that do not lie about: a leaf on the table is none of the table."""
 _FLAT = "table|desk|tablecloth|cloth|floor|ground|shelf|bed|grass|sand|carpet|chair|sofa|bench"
+_PARTS = rf"(?:(?:{'|'.join(sorted(PARTS))})(?:e?s)?|leaves|feet)"
 _OF_ITS_THING = re.compile(
-    rf"\b((?:(?:{'|'.join(sorted(PARTS))})(?:e?s)?|leaves|feet)(?= of )|{_FIXED}s?(?= on (?!(?:\w+ ){{0,3}}(?:{_FLAT})\b)))"
+    rf"\b({_PARTS}(?= of )|{_FIXED}s?(?= on (?!(?:\w+ ){{0,3}}(?:{_FLAT})\b)))"
     r" (?:of|on) (?:(?:the|an?|my|your|this|that) )?"
     r"((?:(?!(?:on|in|at|to|of|near|next|under|behind|beside|between|and|or|but|with|that|which|is|are)\b)[\w-]+ ){0,3}"
     rf"(?:{'|'.join(sorted(NAMES))})s?)\b",
@@ -43,12 +44,12 @@ _OF_ITS_THING = re.compile(
 """A part of a thing: "the nose of the bear" and "the nose on the bear" ask for the bear nose."""
 _HAS_PART = re.compile(
     rf"^(?:does|do|has|have) (?:(?:the|an?|my|your|this|that) )?((?:[\w-]+ ){{0,2}}(?:{'|'.join(sorted(NAMES))})s?) "
-    rf"(?:have |got )(?:(?:got|an?|any|the|some) )*((?:{'|'.join(sorted(PARTS))})(?:e?s)?)$",
+    rf"(?:have |got )(?:(?:got|an?|any|the|some) )*({_PARTS})$",
     re.IGNORECASE,
 )
 """Whether a thing has a part: "does the mug have a handle" asks for the mug handle."""
 _HAS_PARTS = re.compile(
-    rf"^how many ((?:{'|'.join(sorted(PARTS))})(?:e?s)?) (?:does|do) (?:(?:the|an?|my|your|this|that) )?"
+    rf"^how many ({_PARTS}) (?:does|do) (?:(?:the|an?|my|your|this|that) )?"
     rf"((?:[\w-]+ ){{0,2}}(?:{'|'.join(sorted(NAMES))}))s? have$",
     re.IGNORECASE,
 )
@@ -60,6 +61,7 @@ _NO_PART = re.compile(
 """That a thing lacks a part: "bottle that has no cork" is a bottle without cork."""
 _NO = r"(?:no|not (?:an?|any)) (?!more\b|one\b)"
 _NONE = (
+    (re.compile(r"^(is|are|was|were) there not (?=(?:an?|any)\b)", re.IGNORECASE), r"\1 there "),
     (
         re.compile(r"^(is|are|was|were) (.+?) neither (?=.+ nor )(?<!there neither )", re.IGNORECASE),
         r"\2 that \1 neither ",

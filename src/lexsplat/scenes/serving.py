@@ -136,7 +136,10 @@ def error_document(error: LexsplatError) -> dict[str, Any]:
 def sentence(answer: Mapping[str, Any]) -> str:
     """An answer of `find_phrase` in one plain sentence."""
     understood = worded(answer["understood"])
-    if answer["present"] == "no":
+    says_few = understood.startswith(("(no ", "(at most "))  # which may be so without instances
+    if says_few and not answer["instances"] and answer["present"] != "unsure":
+        text = f"It is {'' if answer['present'] == 'yes' else 'not '}so: {understood[1:-1]}."
+    elif answer["present"] == "no":
         text = f"Not here: nothing fits {understood}."
     elif not answer["instances"] and answer["present"] == "unsure":
         text = f"Unsure: nothing certain is found for {understood}."

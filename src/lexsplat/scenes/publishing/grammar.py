@@ -8,12 +8,13 @@ from typing import Any
 from lexsplat.queries import leftovers, patterns, questions
 from lexsplat.queries.colors import COLOR_WORDS, NEAR
 from lexsplat.queries.kinds import KIND_PHRASES
+from lexsplat.queries.meaning import known_words
 from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, STUFF, SURFACES
 
 _OF_THE_GRAMMAR = (
     "RELATION", "BETWEEN", "CORNER", "PART", "ASIDE", "NEAR_ME", "MY_SIDE", "DETERMINER", "THE_ONE", "EXCEPT", "NOT",
     "BOTH", "SIZE", "OF_TWO", "PICK", "IS_PICK", "EXTREME", "ORDINAL", "QUANTITY", "QUALITY", "MADE_OF", "THING_WORD",
-    "SOMETHING", "VIEWER", "TO_A_SIDE", "AND_NOT",
+    "SOMETHING", "VIEWER", "TO_A_SIDE", "AND_NOT", "AT_MOST", "NONE_OF", "NEITHER", "CLOSER", "IDENTITY",
 )  # fmt: skip
 _WHICH_OF = re.compile(
     rf"^(?:which|what|who)\b.*?\b(?:is|are) (?:the )?(?P<which>{'|'.join(patterns.COMPARATIVES)}|nearer|closer|"
@@ -24,8 +25,12 @@ _WHICH_OF = re.compile(
 """`patterns.WHICH_OF` without its condition on a group, which browsers do not have."""
 
 
-def page_grammar() -> dict[str, Any]:
-    """Patterns as sources of regular expressions of browsers, all of which ignore case, and lists of words."""
+def page_grammar(clip: str = "") -> dict[str, Any]:
+    """Patterns as sources of regular expressions of browsers, all of which ignore case, and lists of words.
+
+    Args:
+        clip: Name of the encoder of the scene, some of whose words the page splits and joins.
+    """
     found = {name.lower(): getattr(patterns, name) for name in _OF_THE_GRAMMAR}
     found |= {**questions.FOR_PAGES, **leftovers.FOR_PAGES, "which_of": _WHICH_OF}
     return {
@@ -46,6 +51,7 @@ def page_grammar() -> dict[str, Any]:
             "names": sorted(NAMES),
             "surfaces": sorted(SURFACES),
             "stuff": sorted(STUFF),
+            "in_compounds": sorted(known_words(clip)),
         },
         "materials": patterns.MATERIAL,
     }

@@ -70,7 +70,7 @@ def scene_manifest(
         "text": None,
         "objects": None,
         "kinds": None,
-        "grammar": page_grammar(),
+        "grammar": page_grammar(scene.clip),
         "views": view_entries(scene),
         "licenses": {"page.js": "Apache-2.0 and those of LICENSES.txt"},
         "provenance": {**scene.encoder_identity(), "built_with": built_with},
