@@ -45,8 +45,17 @@ def select() -> Callable[..., Selection]:
     return select
 
 
-def asked(text: str, words: dict[str, Selection], objects: tuple[Selection, ...] = ()) -> Selection:
-    return answer(parse(text), Searched(lambda word: words[word], lambda _: None, lambda: objects))
+def asked(
+    text: str,
+    words: dict[str, Selection],
+    objects: tuple[Selection, ...] = (),
+    colors: dict[str, list[str]] | None = None,
+) -> Selection:
+    told = colors or {}
+    searched = Searched(
+        lambda word: words[word], lambda _: None, lambda: objects, lambda each: told.get(each.phrase, [])
+    )
+    return answer(parse(text), searched)
 
 
 def test_an_apple_that_is_red_and_a_bit_green_is_counted_once(select):
@@ -150,3 +159,32 @@ def test_what_is_a_thing_of_another_name_is_taken_off(select):
     words = {"toy": select("apple", "board", "pole"), "apple": select("apple", "other apple")}
     assert torch.equal(asked("toys that are not apples", words).mask, select("board", "pole").mask)
     assert torch.equal(asked("toys that are apples", words).mask, select("apple").mask)
+
+
+COLORS = {"apple": ["red"], "board": ["red", "brown"], "pole": ["gray", "brown"]}
+
+
+@pytest.mark.parametrize(
+    ("text", "names", "present", "note"),
+    [
+        ("something red", {"apple", "board"}, "yes", ""),
+        ("gray things", {"pole"}, "yes", ""),
+        ("brown things", {"board", "pole"}, "unsure", "no thing is mainly brown"),
+        ("something blue", set(), "no", ""),
+        ("things that are not red", {"pole"}, "yes", ""),
+        ("things that are not brown", {"apple", "board", "pole"}, "yes", ""),
+    ],
+)
+def test_a_thing_that_a_color_is_only_a_part_of_may_be_meant_where_none_is_mainly_of_it(
+    select, text, names, present, note
+):
+    objects = tuple(select(name) for name in COLORS)
+    found = asked(text, {}, objects, COLORS)
+    assert {each.phrase for each in found.instances} == names
+    assert (found.present, found.note) == (present, note)
+
+
+def test_a_toy_that_is_only_partly_black_is_noted_as_a_toy(select):
+    toys = (select("apple").described(phrase="toy car"),)
+    found = asked("the black toy", {"toy": toys[0]}, toys, {"toy car": ["red", "black"]})
+    assert (found.present, found.count, found.note) == ("unsure", 1, "no toy is mainly black")

@@ -36,7 +36,9 @@ def ball_at_the_edge_of_a_cloth() -> Scene:
     room = np.random.default_rng(2).uniform([-9, -9, 5], [9, 9, 6], (25000, 3))
     ball = np.random.default_rng(0).normal(size=(600, 3))
     ball = 0.3 * ball / np.linalg.norm(ball, axis=1, keepdims=True) + [0, 0, 0.3]
-    labels = np.concatenate([np.where(is_cloth, SHEET, TABLE), np.repeat([TABLE, BALL, ROOM], [4000, 600, 25000])])
+    labels = np.concatenate(
+        [np.where(is_cloth, SHEET, TABLE), np.repeat([TABLE, BALL, ROOM], [4000, 600, 25000])]
+    )
     colors = np.array([WOOD, [0.5, 0.5, 0.5], CLOTH, [0.5, 0.5, 0.5]])[labels]
     points = np.concatenate([top, legs, ball, room])
     gaussians = gaussians_from_points(points, colors, sh_degree=0, opacity=0.95)

@@ -81,7 +81,7 @@ class Edit:
         turn: Degrees about the up direction, counterclockwise from above.
         scale: Factor on the size; the bottom stays at its height.
         output: The new scene folder, for save.
-        yes: Discard all steps without asking.
+        yes: Discard all steps without asking, or change what may not be what the phrase names.
         clip: Text encoder: a name on the Hugging Face Hub or a folder.
         device: "auto" takes CUDA where there is a GPU.
     """
@@ -123,7 +123,7 @@ class Edit:
 
     def _check_meaning(self) -> None:
         used = {"scene", "action", "clip", "device", *_OPTIONS.get(self.action, ())}
-        used.update(_CHOICE if self.action in CHANGES else ())
+        used.update((*_CHOICE, "yes") if self.action in CHANGES else ())
         for option in dataclasses.fields(self):
             if option.name not in used and getattr(self, option.name) != option.default:
                 negation = "no-" if option.default is True else ""
@@ -187,10 +187,13 @@ class Edit:
 
     def _change(self, editor: Editor) -> None:
         from lexsplat.scenes.editing import Motion
+        from lexsplat.scenes.listed import refuse_doubtful
 
         world = editor.scene.world
         by, grow, shrink = (each and each.units(world) for each in (self.by, self.grow, self.shrink))
         chosen = editor.scene.find(self.select or "", self.view, threshold=self.threshold)
+        if self.threshold is None and not self.yes:
+            refuse_doubtful(editor.scene, self.select or "", chosen)
         chosen = chosen.largest() if self.largest else chosen
         chosen = chosen.grow(*grow) if grow else chosen
         chosen = chosen.shrink(*shrink) if shrink else chosen

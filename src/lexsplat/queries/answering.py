@@ -136,11 +136,17 @@ def _things(searched: Searched) -> tuple[Selection, ...]:
 
 
 def _colored(phrase: Colored, searched: Searched) -> Selection:
-    """The instances with this main color; if there are none, those that also have it."""
+    """The instances with this main color; if there are none, those that also have it, which are "unsure"."""
     targets = answer(phrase.target, searched)
     colors = [(searched.colors(each), each) for each in _certain(targets)]
     main = tuple(each for words, each in colors if phrase.color in words[:1])
-    return _joined(targets, main or tuple(each for words, each in colors if phrase.color in words))
+    also = () if main else tuple(each for words, each in colors if phrase.color in words)
+    if not also:
+        return _joined(targets, main)
+    kind = phrase.target.text if isinstance(phrase.target, Thing) else "thing"
+    notes = (targets.note, f"no {kind} is mainly {phrase.color}")
+    present = min(targets.present, "unsure", key=PRESENCES.index)
+    return replace(_joined(targets, also, present), note="; ".join(filter(None, notes)))
 
 
 def _related(phrase: Related, searched: Searched) -> Selection:
@@ -238,6 +244,8 @@ def _united(first: Selection, second: Selection, colors_of_one: bool = False) ->
 def _except(phrase: Except, searched: Searched) -> Selection:
     first, second = answer(phrase.first, searched), answer(phrase.second, searched)
     others = _certain(second)
+    if isinstance(phrase.second, Colored) and second.present == "unsure":
+        others = []  # a thing that is only partly red is not red
     if phrase.lacks:
         return _joined(first, tuple(_without_any(_certain(first), others)))
     kept = []

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from numpy.typing import NDArray
+
+from lexsplat.queries.vocabulary import QUALITIES
 
 _EXAMPLES = (
     ("black", (25, 25, 25)), ("gray", (125, 125, 125)), ("white", (225, 225, 220)), ("red", (175, 40, 35)),
@@ -29,6 +33,7 @@ NEAR = (
 """Pairs of colors of which one may be seen as the other in another light."""
 SEEN = 0.1
 """A thing is seen in a color that has this share of its visible weight."""
+_ARTICLES = frozenset({"a", "an", "the", "my", "your"})
 _LEAST = 0.2
 """A word stands for at least this share of the visible weight, except for the first word."""
 
@@ -69,9 +74,27 @@ def color_told(phrase: str) -> set[str]:
 
 
 def without_color(phrase: str) -> str:
-    """A phrase without the colors that it tells: "mug" of "red mug"."""
-    told = color_told(phrase)
-    return " ".join(word for word in phrase.split() if word.lower().replace("grey", "gray") not in told)
+    """A phrase without the colors that it tells: "mug" of "red mug", "striped mug" of "red and blue striped mug"."""
+    return _without(phrase, color_told(phrase))
+
+
+def unqualified(phrase: str) -> str:
+    """A phrase without articles, and without colors, materials and the like: "duck" of "the metal duck"."""
+    return _without(phrase, QUALITIES | _ARTICLES)
+
+
+def _without(phrase: str, left_out: Collection[str]) -> str:
+    """A phrase without some words before its last one, and without what joins them."""
+    *before, last = phrase.split() or [""]
+    small = [word.lower().rstrip(",").replace("grey", "gray") for word in before]
+    gone = [word in left_out for word in small]
+    around = [any(gone[max(0, place - 1) : place + 2]) for place in range(len(gone))]
+    kept = [
+        word
+        for word, plain, out, beside in zip(before, small, gone, around)
+        if not out and not (beside and plain in ("and", "or", ""))
+    ]
+    return " ".join([*kept, last])
 
 
 def may_be(told: set[str], seen: set[str]) -> bool:

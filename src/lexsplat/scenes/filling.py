@@ -227,7 +227,9 @@ def _fill_below(
     raised = _continued(heights, hole, waves if waves.sum() >= FEWEST else known)
     places = np.concatenate([photo.cells[hole], raised[:, None]], 1)
     colors = gaussians.sh0.detach().cpu().double().numpy()[members, 0] * SH_C0 + 0.5
-    nearest = _sources(local[members, :2] / surface.radius, colors, photo.cells[hole] / surface.radius, painted)
+    nearest = _sources(
+        local[members, :2] / surface.radius, colors, photo.cells[hole] / surface.radius, painted
+    )
     x, y, z, w = Rotation.from_matrix(surface.axes.T).as_quat()
     same = np.tile([w, x, y, z, *np.log(photo.size * np.array(_SIZES))], (len(painted), 1))
     disks = np.concatenate([surface.origin + places @ surface.axes, same, painted], 1).astype("<f4")
@@ -252,7 +254,9 @@ def _of_surface(low: Mask, counted: Mask, segments: Segments | None) -> Mask:
     return found
 
 
-def _sources(places: FloatArray, colors: FloatArray, at: FloatArray, painted: FloatArray) -> NDArray[np.int64]:
+def _sources(
+    places: FloatArray, colors: FloatArray, at: FloatArray, painted: FloatArray
+) -> NDArray[np.int64]:
     """What each pixel of a fill continues ``[F]``: a Gaussian of the surface near by and of a like color.
 
     Args:

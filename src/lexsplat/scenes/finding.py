@@ -18,7 +18,7 @@ from lexsplat.queries.phrases import Phrase, Thing, Understood, mended_note, thi
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.spelling import spellings
 from lexsplat.queries.wording import thing_of
-from lexsplat.scenes.words import object_colors
+from lexsplat.scenes.pixels import object_colors
 
 if TYPE_CHECKING:
     from lexsplat.scenes.answers import Answers

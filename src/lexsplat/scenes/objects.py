@@ -21,7 +21,7 @@ from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.answers import rests_on
 from lexsplat.scenes.facts import NO_SEGMENTS
-from lexsplat.scenes.words import object_colors, shown_weights
+from lexsplat.scenes.pixels import object_colors, shown_weights
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene

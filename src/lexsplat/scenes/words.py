@@ -10,23 +10,22 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.queries.colors import SEEN, color_shares, color_told, color_words, may_be
+from lexsplat.queries.colors import color_told, may_be, unqualified
 from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.part_names import DOUBTFUL, is_doubtful
-from lexsplat.queries.parts import FEWEST, HELD, part_scores, with_parts
+from lexsplat.queries.parts import FEWEST, part_scores, with_parts
 from lexsplat.queries.presence import FAINT
 from lexsplat.queries.relevancy import gaussian_relevancy
 from lexsplat.queries.scoring import form_used, scores_in_form
 from lexsplat.queries.selection import Presence, Selection
 from lexsplat.queries.thresholds import BORDER
-from lexsplat.queries.vocabulary import STUFF, SURFACES, is_part_alone, part_named, thing_of_part
-from lexsplat.scenes.formats.tables import colors_of
+from lexsplat.queries.vocabulary import STUFF, SURFACES, is_part, is_part_alone, part_named, thing_of_part
 from lexsplat.scenes.gone import gone_nouns, noun_of
+from lexsplat.scenes.listed import doubt, holding, listed_as
+from lexsplat.scenes.pixels import object_colors, seen_colors
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -76,7 +75,15 @@ def with_objects(scene: Scene, prompt: str, word: Word) -> Word:
     """The answer to a prompt, given its relevancy and its presence by language."""
     if word.presence != "no" and (noun := noun_of(prompt)) in gone_nouns(scene):
         return replace(word, scores=word.own, presence="no", note=f"an edit took the {noun} away")
-    return _if_visible(scene, of_color(scene, prompt, of_part(scene, prompt, of_kind(scene, prompt, word))))
+    word = of_qualities(scene, prompt, of_part(scene, prompt, of_kind(scene, prompt, word)))
+    return noted(scene, prompt, _if_visible(scene, word))
+
+
+def noted(scene: Scene, prompt: str, word: Word) -> Word:
+    """A word that is "unsure" with a note on what it takes, if that is listed as something else."""
+    if word.presence != "unsure" or word.note or form_used(scene.field, scene.query) != "segment":
+        return word
+    return replace(word, note=doubt(scene, prompt, (word.scores >= BORDER) & ~scene.hidden))
 
 
 def _if_visible(scene: Scene, word: Word) -> Word:
@@ -131,31 +138,43 @@ def _is_doubtful(scene: Scene, prompt: str, word: Word) -> bool:
     return is_doubtful(part_named(prompt), place, scene.presence_classifier.part_fits)
 
 
-def of_color(scene: Scene, prompt: str, word: Word) -> Word:
-    """The word as the pixels have it, if its prompt tells a color of a thing.
+def of_qualities(scene: Scene, prompt: str, word: Word) -> Word:
+    """The word as pixels and names have it, if its prompt tells a color or another quality of a thing.
 
-    Encoders take a thing for the same thing in another color, or another thing of that color for it: a banana for a
-    yellow apple, in a scene with a red one. Such a word is "unsure". They also keep the color that a thing had before
-    it was recolored. An object of that name whose pixels have mostly the color is the answer, whatever they say.
+    Encoders take a thing for the same thing in another color, or another thing for it: a banana for a yellow apple,
+    in a scene with a red one. Such a word is "unsure". They also keep the color that a thing had before it was
+    recolored. An object that the prompt without its color names, and whose pixels have mostly the color, is the
+    answer, whatever they say.
     """
     told = color_told(prompt)
-    if not told or form_used(scene.field, scene.query) != "segment" or not scene.field.segments:
+    if not (told or unqualified(prompt) != prompt) or form_used(scene.field, scene.query) != "segment":
+        return word
+    if not scene.field.segments:
         return word
     if word.presence == "yes":
-        held, name = holding(scene, (word.scores >= BORDER) & ~scene.hidden), prompt.lower().split()[-1]
+        taken = (word.scores >= BORDER) & ~scene.hidden
+        held, name = holding(scene, taken), prompt.lower().split()[-1]
         other = held and name in _last_words(scene.objects) - _last_words(held)
-        seen = {color for each in held for color in seen_colors(scene, each)}
-        if not other and (not seen or may_be(told, seen)):
+        if not other and (not told or not held or _is_seen_in(scene, held, told, taken)):
             return word
         word = replace(word, presence="unsure")
-    return _of_members(word, of_color_told(scene, prompt, told))
+    return _of_members(word, of_color_told(scene, prompt, told)) if told else word
 
 
 def of_color_told(scene: Scene, prompt: str, told: set[str]) -> list[Selection]:
-    """The objects of the name in a prompt whose pixels have mostly the color that it tells."""
-    name = prompt.lower().split()[-1]
-    named = [each for each in scene.objects if each.phrase.split()[-1] == name]
+    """The objects that a prompt names without its color, and whose pixels have mostly the color that it tells."""
+    named = [] if is_part(prompt) else listed_as(scene, prompt)
     return [each for each in named if object_colors(scene, each)[0] in told]
+
+
+def _is_seen_in(scene: Scene, things: Sequence[Selection], told: set[str], taken: Tensor) -> bool:
+    """Whether things are seen in a color or a near one, and not only a part of them: a bear with a light belly."""
+    if not may_be(told, {color for each in things for color in seen_colors(scene, each)}):
+        return False
+    return any(
+        2 * int(taken[each.indices].sum()) > len(each) or told & set(object_colors(scene, each))
+        for each in things
+    )
 
 
 def _of_members(word: Word, members: Sequence[Selection]) -> Word:
@@ -170,12 +189,6 @@ def _of_members(word: Word, members: Sequence[Selection]) -> Word:
 
 def _last_words(things: Sequence[Selection]) -> set[str]:
     return {each.phrase.split()[-1] for each in things}
-
-
-def holding(scene: Scene, taken: Tensor) -> list[Selection]:
-    """The objects of a scene that have at least `HELD` of some Gaussians ``[N]`` bool."""
-    least = HELD * max(int(taken.sum()), 1)
-    return [each for each in scene.objects if int(taken[each.indices].sum()) >= least]
 
 
 def _of_objects(scene: Scene, part: str, word: Word, taken: Tensor) -> Word:
@@ -196,29 +209,3 @@ def _of_objects(scene: Scene, part: str, word: Word, taken: Tensor) -> Word:
     scores, own = (torch.stack(rows).amax(0) for rows in zip(*((w.scores, w.own) for w in found.values())))
     note = f"the {part} of the {' and the '.join(found)}"
     return replace(word, scores=scores, own=own, presence=presence, note=note)
-
-
-def object_colors(scene: Scene, thing: Selection) -> list[str]:
-    """The color words of an object, the most frequent first (`lexsplat.queries.colors`)."""
-    return color_words(*_pixels(scene, thing))
-
-
-def seen_colors(scene: Scene, thing: Selection) -> list[str]:
-    """Every color that an object is seen in, also those of a small part of it; kept with the selection."""
-    known: dict[str, list[str]] = thing.__dict__
-    if "_seen_colors" not in known:
-        shares = color_shares(*_pixels(scene, thing))
-        known["_seen_colors"] = [color for color, share in shares.items() if share >= SEEN]
-    return known["_seen_colors"]
-
-
-def _pixels(scene: Scene, thing: Selection) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The colors of an object's Gaussians ``[M, 3]`` in 0..1, and what the views show of each ``[M]``."""
-    colors = colors_of(thing.selected).astype(np.float64) / 255
-    return colors, shown_weights(scene)[thing.indices].double().cpu().numpy()
-
-
-def shown_weights(scene: Scene) -> torch.Tensor:
-    """Visible weight of each Gaussian in the training views ``[N]``; its opacity if that is not known."""
-    segments = scene.field.segments
-    return scene.gaussians.opacities.detach() if segments is None else segments.masses

@@ -35,8 +35,8 @@ from lexsplat.runtime.fingerprints import digest
 from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.gone import gone_nouns
 from lexsplat.scenes.library.records import damaged, mapped_tensors
+from lexsplat.scenes.pixels import seen_colors
 from lexsplat.scenes.scene import Scene
-from lexsplat.scenes.words import seen_colors
 
 _MOST = 2048
 """Segments of the lowest kept level, at most, unless the coarsest level has more."""

@@ -14,10 +14,10 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.kinds import KIND_PHRASES, is_of_kind
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.vocabulary import SURFACES
+from lexsplat.scenes.pixels import object_colors, seen_colors
 from lexsplat.scenes.publishing.grammar import page_grammar
 from lexsplat.scenes.publishing.sidecar import selection_rule
 from lexsplat.scenes.scene import Scene
-from lexsplat.scenes.words import object_colors, seen_colors
 
 FORMAT, FORMAT_VERSION = "lexsplat-page", 7
 DRAWN_SPLATS = 1_000_000

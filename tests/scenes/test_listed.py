@@ -1,0 +1,137 @@
+"""Where a scene lists something else than what a phrase names: notes, colors of synonyms, and refused edits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from lexsplat import cli
+from lexsplat.queries.colors import unqualified, without_color
+from lexsplat.runtime.errors import QueryError
+from lexsplat.scenes.editing import Editor
+from lexsplat.scenes.listed import listed_as, refuse_doubtful
+from lexsplat.scenes.scene import Scene, open_scene
+from lexsplat.scenes.words import of_color_told
+
+
+@pytest.fixture(scope="module")
+def demo() -> Scene:
+    return open_scene("demo", device="cpu")
+
+
+def listed(scene: Scene, name: str):
+    return next(each for each in scene.objects if each.phrase == name)
+
+
+@pytest.mark.parametrize(
+    ("phrase", "plain", "bare"),
+    [
+        ("red mug", "mug", "mug"),
+        ("red and white checkered cloth", "checkered cloth", "cloth"),
+        ("a red and white ball", "a ball", "ball"),
+        ("shiny metal duck", "shiny metal duck", "duck"),
+        ("salt and pepper", "salt and pepper", "salt and pepper"),
+        ("orange", "orange", "orange"),
+        ("grey vase", "vase", "vase"),
+    ],
+)
+def test_a_phrase_loses_its_colors_and_qualities_with_what_joins_them(phrase, plain, bare):
+    assert (without_color(phrase), unqualified(phrase)) == (plain, bare)
+
+
+@pytest.mark.parametrize(
+    ("phrase", "told"),
+    [
+        ("duck made of metal", 'what best fits "metal duck" is listed as the red apple'),
+        (
+            "Is the lamp black?",
+            'what best fits "black lamp" is listed as the gray floor; the table lamp is mainly white',
+        ),
+        ("blue vase", 'what best fits "blue vase" is listed as the blue mug; the vase is mainly white'),
+        ("is the teddy bear white?", "the teddy bear is mainly brown"),
+        ("white bear", "the teddy bear is mainly brown"),
+        ("red flower", 'what best fits "red flower" is listed as the red apple'),
+        ("candle", 'what best fits "candle" is listed as the green bottle'),
+    ],
+)
+def test_an_unsure_answer_says_what_the_scene_lists_there(demo, phrase, told):
+    found = demo.find(phrase)
+    assert (found.present, found.note) == ("unsure", told)
+
+
+@pytest.mark.parametrize(
+    "phrase", ["metal ring", "brown bear", "gray vase", "white cone", "bear eye", "wooden duck"]
+)
+def test_what_nothing_contradicts_has_no_such_note(demo, phrase):
+    assert "lists" not in demo.find(phrase).note
+    assert "mainly" not in demo.find(phrase).note
+
+
+@pytest.mark.parametrize(
+    ("phrase", "name"),
+    [
+        ("white cloth", "tablecloth"),
+        ("red and white checkered cloth", "tablecloth"),
+        ("blue cup", "mug"),
+        ("yellow books", "stack of books"),
+    ],
+)
+def test_a_color_of_another_name_of_a_thing_is_that_of_its_pixels(demo, phrase, name):
+    found = demo.find(phrase)
+    assert (found.present, found.count) == ("yes", 1)
+    assert torch.equal(found.mask, listed(demo, name).mask)
+
+
+def test_a_recolored_thing_is_found_in_its_color_by_its_other_names(demo):
+    editor = Editor(demo)
+    editor.recolor(demo.select("mug"), "red")
+    editor.recolor(editor.scene.select("tablecloth"), "blue")
+    for phrase, name in (("red cup", "red mug"), ("blue cloth", "blue tablecloth")):
+        found = editor.scene.find(phrase)
+        assert found.present == "yes", phrase
+        assert torch.equal(found.mask, editor.scene.find(name).mask)
+    assert editor.scene.find("green cup").present != "yes"
+
+
+def test_what_a_phrase_selects_only_a_part_of_is_not_listed_under_it(demo):
+    assert [each.phrase for each in listed_as(demo, "white cloth")] == ["tablecloth"]
+    assert not listed_as(demo, "red bicycle")
+    assert [each.phrase for each in listed_as(demo, "blue mug handle")] == ["mug"]
+    assert not of_color_told(demo, "blue mug handle", {"blue"})
+
+
+def test_an_edit_of_what_is_listed_as_something_else_is_refused(demo):
+    for phrase, told in {
+        "metal duck": ("perhaps the red apple", 'select "red apple"'),
+        "black things": ("perhaps the red toy car", 'select "red toy car"'),
+        "metal duck on the table": ("perhaps the red apple", "--yes"),
+    }.items():
+        with pytest.raises(QueryError) as refused:
+            refuse_doubtful(demo, phrase, demo.find(phrase))
+        assert all(words in str(refused.value) for words in told), phrase
+        assert "\n" not in str(refused.value)
+    nowhere = replace(demo.find("candle"), mask=demo.hidden)
+    with pytest.raises(QueryError, match="without a name; give --yes"):
+        refuse_doubtful(demo, "candle", nowhere)
+
+
+@pytest.mark.parametrize("phrase", ["red apple", "purple mug", "black toy car", "giraffe", "duck and apple"])
+def test_an_edit_of_what_is_listed_under_its_noun_or_certain_is_not_refused(demo, phrase):
+    refuse_doubtful(demo, phrase, demo.find(phrase))
+
+
+@pytest.mark.slow
+def test_the_command_line_deletes_no_apple_for_a_duck_of_metal_unless_told_so(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    steps = Path("demo_edits.jsonl")
+    delete = ["edit", "demo", "delete", "--select", "metal duck", "--no-fill"]
+    assert cli.main(delete) == 1
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert 'perhaps the red apple; select "red apple" if you mean that, or give --yes' in error
+    assert not steps.exists()
+    assert cli.main([*delete, "--yes"]) == 0
+    assert steps.exists()
+    assert "is listed as the red apple" in capsys.readouterr().err
