@@ -9,6 +9,7 @@ from support.command_line import fails_in_one_line
 from support.schemas import validated
 
 from lexsplat import cli, open_scene
+from lexsplat.queries.selection import Selection
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.scale import store_world
 
@@ -24,7 +25,7 @@ def scaled(tmp_path_factory) -> str:
 
 
 @pytest.fixture(scope="module")
-def things():
+def mug_and_banana() -> list[Selection]:
     scene = open_scene("demo", device="cpu")
     return [scene.find(phrase) for phrase in ("mug", "banana")]
 
@@ -35,9 +36,9 @@ def printed(capsys, *arguments: str) -> str:
     return capsys.readouterr().out
 
 
-def test_lengths_are_those_of_the_boxes_and_the_points(things, scaled, capsys):
-    mug, banana = things
-    points, others = (thing.selected.means.detach().double().numpy() for thing in things)
+def test_lengths_are_those_of_the_boxes_and_the_points(mug_and_banana, scaled, capsys):
+    mug, banana = mug_and_banana
+    points, others = (thing.selected.means.detach().double().numpy() for thing in mug_and_banana)
     expected = {
         "centers": np.linalg.norm(mug.center - banana.center),
         "gap": min(np.sqrt(((others - point) ** 2).sum(1)).min() for point in points),
@@ -54,8 +55,10 @@ def test_lengths_are_those_of_the_boxes_and_the_points(things, scaled, capsys):
         assert known[name]["meters"] == pytest.approx(METERS * known[name]["units"], abs=1e-5), name
 
 
-def test_lengths_are_printed_in_scene_units_and_in_meters_where_they_are_known(things, scaled, capsys):
-    apart = float(np.linalg.norm(things[0].center - things[1].center))
+def test_lengths_are_printed_in_scene_units_and_in_meters_where_they_are_known(
+    mug_and_banana, scaled, capsys
+):
+    apart = float(np.linalg.norm(mug_and_banana[0].center - mug_and_banana[1].center))
     out = printed(capsys, scaled, "mug", "banana")
     assert f"between their centers: {METERS * apart:.3f} m ({apart:.3f} scene units)" in out
     out = printed(capsys, "demo", "mug", "banana")
