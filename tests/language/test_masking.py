@@ -189,7 +189,7 @@ def test_geometry_does_not_depend_on_masked_pixels(halves):
 def test_masks_without_a_photo_are_reported(tmp_path, caplog):
     masked_capture(tmp_path, PINHOLE, paint=None)
     Image.new("L", (64, 48)).save(tmp_path / "masks" / "nobody.png")
-    Image.new("L", (64, 48)).save(tmp_path / "masks" / "a.png.jpg")
+    Image.new("L", (64, 48)).save(tmp_path / "masks" / "nowhere.jpg")
     scene = load_capture(tmp_path)
     assert len([warning for warning in scene.warnings if "masks" in warning]) == 1
     assert "2 masks" in scene.warnings[-1]
