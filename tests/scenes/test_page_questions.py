@@ -25,7 +25,8 @@ SINGLE = (
     "red toy", "orange fruit", "yellow fruit", "blue toy", "something with leaves", "things with leaves",
     "can you see the mug?", "How many books?", "zebra", "red apple", "handle", "which things are toys?",
     "is the plant dead?", "where is the duck standing?", "how many wheels does the car have?",
-    "things that are animals",
+    "things that are animals", "white cloth", "red and white checkered cloth", "black things", "white bear",
+    "metal duck", "blue vase", "yellow books", "vase with flowers",
 )  # fmt: skip
 FURTHER = (
     "banana next to the apple", "apple on the table", "what is on the table?", "the biggest toy", "the largest fruit",
@@ -37,6 +38,7 @@ FURTHER = (
     "small table", "large lamp", "all except the books", "all but the apple",
     "mug that is not blue", "book that is larger than the mug", "fruits that are not apples",
     "toys that are animals", "things that are not toys",
+    "mug with a handle", "toy car with wheels",
 )  # fmt: skip
 """What needs relations, an order, a comparison, a number or an exception."""
 ASK = """async (prompts) => {

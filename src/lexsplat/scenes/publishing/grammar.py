@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from lexsplat.queries import leftovers, patterns, questions
+from lexsplat.queries import having, leftovers, patterns, questions
 from lexsplat.queries.colors import COLOR_WORDS, NEAR
 from lexsplat.queries.kinds import KIND_PHRASES
 from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, STUFF, SURFACES
@@ -27,7 +27,7 @@ _WHICH_OF = re.compile(
 def page_grammar() -> dict[str, Any]:
     """Patterns as sources of regular expressions of browsers, all of which ignore case, and lists of words."""
     found = {name.lower(): getattr(patterns, name) for name in _OF_THE_GRAMMAR}
-    found |= {**questions.FOR_PAGES, **leftovers.FOR_PAGES, "which_of": _WHICH_OF}
+    found |= {**questions.FOR_PAGES, **leftovers.FOR_PAGES, **having.FOR_PAGES, "which_of": _WHICH_OF}
     return {
         "patterns": {name: _source(pattern) for name, pattern in found.items()},
         "replaced": {
