@@ -188,3 +188,22 @@ def test_a_toy_that_is_only_partly_black_is_noted_as_a_toy(select):
     toys = (select("apple").described(phrase="toy car"),)
     found = asked("the black toy", {"toy": toys[0]}, toys, {"toy car": ["red", "black"]})
     assert (found.present, found.count, found.note) == ("unsure", 1, "no toy is mainly black")
+
+
+def test_what_has_a_part_is_the_whole_thing_and_not_the_part(select):
+    both = select("apple", "other apple")
+    words = {"apple": both, "apple stem": select("other apple", first=20)}
+    for text in ("apple with a stem", "apples with stems", "the apple that has a stem"):
+        found = asked(text, words)
+        assert torch.equal(found.mask, select("other apple").mask), text
+        assert (found.present, found.count) == ("yes", 1)
+    unsure = {**words, "apple stem": replace(words["apple stem"], present="unsure")}
+    assert asked("apple with a stem", unsure).present == "unsure"
+
+
+def test_what_the_whole_phrase_describes_has_the_part_that_is_not_found_alone(select):
+    gone = replace(select("apple", first=20), present="no")
+    words = {"apple": select("apple", "other apple"), "apple leaf": gone}
+    whole = {**words, "apple with leaves": select("apple"), "apple with a leaf": gone}
+    assert torch.equal(asked("apple with leaves", whole).mask, select("apple").mask)
+    assert asked("apple with a leaf", whole).present == "no"

@@ -135,3 +135,21 @@ def test_the_command_line_deletes_no_apple_for_a_duck_of_metal_unless_told_so(tm
     assert cli.main([*delete, "--yes"]) == 0
     assert steps.exists()
     assert "is listed as the red apple" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("phrase", "name"),
+    [
+        ("mug with a handle", "mug"),
+        ("lamp with a shade", "table lamp"),
+        ("toy car with wheels", "toy car"),
+        ("bottle with a cork", "bottle"),
+        ("bears with ears", "teddy bear"),
+        ("plant with leaves", "potted plant"),
+    ],
+)
+def test_a_thing_with_a_part_is_found_as_a_whole(demo, phrase, name):
+    found = demo.find(phrase)
+    assert (found.present, found.count) == ("yes", 1)
+    assert torch.equal(found.mask, listed(demo, name).mask)
+    assert demo.find("mug with a beak").present != "yes"

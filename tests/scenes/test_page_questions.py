@@ -28,6 +28,8 @@ SINGLE = (
     "things that are animals", "green leaves", "yellow books", "leaves of the plant", "plant leaves", "lampshade",
     "white lampshade", "flowerpot", "teddybear", "cupboard", "what touches the cloth?", "loaves of bread",
     "is the apple far from the lamp?", "which object is the heaviest?", "apple touching the banana",
+    "white cloth", "red and white checkered cloth", "black things", "white bear",
+    "metal duck", "blue vase", "vase with flowers",
 )  # fmt: skip
 FURTHER = (
     "banana next to the apple", "apple on the table", "what is on the table?", "the biggest toy", "the largest fruit",
@@ -42,6 +44,7 @@ FURTHER = (
     "there are no violins", "fewer than three apples", "at most two mugs", "two or fewer mugs", "is the duck a toy?",
     "is the banana longer than the apple?", "is the duck closer than the mug?", "neither the mug nor the duck",
     "objects that are neither red nor yellow", "is there neither a mug nor a duck?", "no toys on the table",
+    "mug with a handle", "toy car with wheels",
 )  # fmt: skip
 """What needs relations, an order, a comparison, a number or an exception."""
 ASK = """async (prompts) => {

@@ -1,6 +1,7 @@
 // Kinds of things, such as "toy", and things in a color: answered by the objects of the scene (lexsplat.queries.kinds).
 
 import type { Found } from "./answers";
+import { singulars } from "./dictionary";
 import type { Geometry, Place } from "./geometry";
 import { type ObjectEntry, PageError } from "./manifest";
 
@@ -27,6 +28,10 @@ export class Kinds {
     return this.#objects.map(({ name }) => name);
   }
 
+  entry(place: number): ObjectEntry {
+    return this.#objects[place];
+  }
+
   has(kind: string): boolean {
     return this.#members.has(kind);
   }
@@ -40,14 +45,31 @@ export class Kinds {
     const all = (this.#members.get(kind) ?? []).filter((place) => this.#places![place]?.splats.length);
     const inColor = (most: number): number[] => all.filter((place) => this.#objects[place].colors?.slice(0, most).includes(color));
     const main = color ? inColor(1) : all;
-    return this.#answer(main.length ? main : inColor(Infinity), plain);
+    if (main.length) return this.#answer(main, plain);
+    const also = this.#answer(inColor(Infinity), plain);
+    return also && { ...also, presence: "unsure", note: `no ${kind || "thing"} is mainly ${color}` };
   }
 
-  /** The objects of a name that are mostly in one of some colors; null if there are none. */
-  inColors(noun: string, colors: string[], plain: Float32Array): ReturnType<Kinds["find"]> {
+  /** The places of the objects with a noun, given its singulars; of "stack of books" stack and book. */
+  named(nouns: string[]): number[] {
+    const own = (name: string): string[] => [name.split(" of ")[0], name].map((words) => words.split(" ").at(-1)!);
+    const isOne = (name: string): boolean => own(name).some((noun) => singulars(noun).some((form) => nouns.includes(form)));
+    return [...this.#objects.keys()].filter((place) => isOne(this.#objects[place].name));
+  }
+
+  /** The places of the objects of which some splats are at least half. */
+  covered(splats: number[]): number[] {
+    const counts = this.#objects.map(() => 0);
+    for (const i of splats) if (this.content[i] < counts.length) counts[this.content[i]]++;
+    const sizes = this.#objects.map(() => 0);
+    for (const place of this.content) if (place < sizes.length) sizes[place]++;
+    return [...counts.keys()].filter((place) => counts[place] > 0 && 2 * counts[place] >= sizes[place]);
+  }
+
+  /** Of some objects those that are mostly in one of some colors; null if there are none. */
+  inColors(listed: number[], colors: string[], plain: Float32Array): ReturnType<Kinds["find"]> {
     this.#places ??= this.#found();
-    const isOne = ({ name, colors: own }: ObjectEntry): boolean => name.split(" ").at(-1) === noun && colors.includes(own?.[0] ?? "");
-    const all = [...this.#objects.keys()].filter((place) => isOne(this.#objects[place]) && this.#places![place].splats.length);
+    const all = listed.filter((place) => colors.includes(this.#objects[place].colors?.[0] ?? "") && this.#places![place].splats.length);
     const found = this.#answer(all, plain);
     return found && { ...found, note: "" };
   }

@@ -290,6 +290,8 @@ class Parser {
     if (word) return word[1] ? this.#colored(`something ${word[1]}`) : [thing("")];
     const something = grammar.match("something", words);
     if (something) return this.#colored(`something ${something[1]}`);
+    const part = grammar.match("with_part", words);
+    if (part && !grammar.has("told_colors", part[1])) return this.#of("with", part[1], part[2]);
     return words ? this.#colored(words) : [];
   }
 

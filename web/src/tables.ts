@@ -79,7 +79,11 @@ export class Tables implements Source {
 
   async #thing({ text, color: own, exact }: Thing, prompt: string, color: string): Promise<Answer | null> {
     if (exact) return this.#plain(text.toLowerCase(), prompt, color);
-    if (text && !own) return this.#mended(text.toLowerCase(), prompt, color);
+    if (text && !own) {
+      const unseen = this.dictionary.grammar.match("with_attribute", text)?.[2];
+      const answer = await this.#mended(text.toLowerCase(), prompt, color);
+      return unseen ? doubtful(answer, `“${unseen}” is not looked for by itself`) : answer;
+    }
     const { threshold } = this.geometry.rule;
     const phrase = [own, text || (own ? "things" : "any object")].filter(Boolean).join(" ");
     const none = { scores: new Float32Array(this.geometry.count), presence: "no" as const, places: [] };
@@ -154,8 +158,21 @@ export class Tables implements Source {
   async #plain(text: string, prompt: string, color: string, isOwn = false): Promise<Answer | null> {
     const plain = await this.#byLanguage(text, prompt, color, isOwn);
     const told = plain && plain.presence !== "yes" && this.segments ? this.#colorsTold(plain.phrase) : [];
-    const inColor = told.length ? this.kinds.inColors(plain!.phrase.toLowerCase().split(" ").at(-1)!, told, plain!.scores) : null;
-    return inColor ? { ...plain!, ...inColor } : plain;
+    if (!plain || told.length === 0 || (this.cuts && isPart(plain.phrase, this.cuts.words))) return plain;
+    const inColor = this.kinds.inColors(await this.#listedAs(plain.phrase, told, prompt), told, plain.scores);
+    return inColor ? { ...plain, ...inColor } : plain;
+  }
+
+  /** The places in the list of what a phrase names without its color: by its noun, or else by what that selects. */
+  async #listedAs(phrase: string, told: string[], prompt: string): Promise<number[]> {
+    const words = phrase.toLowerCase().split(" ");
+    const named = this.kinds.named(singulars(words.at(-1)!));
+    if (named.length) return named;
+    const out = words.map((word, n) => n < words.length - 1 && told.includes(word.replace("grey", "gray")));
+    const joins = (n: number): boolean => ["and", "or"].includes(words[n]) && [out[n - 1], out[n + 1]].includes(true);
+    const bare = words.filter((_, n) => !out[n] && !joins(n)).join(" ");
+    const answer = await this.#plain(bare, prompt, "");
+    return answer?.presence === "yes" ? this.kinds.covered(this.#seen(answer.scores, answer.threshold, this.segments!)) : [];
   }
 
   /** `isOwn` words are not asked for in the singular. */
@@ -221,17 +238,21 @@ export class Tables implements Source {
     return { scores, own, ...parts, presence: presence === "yes" && !sure ? ("unsure" as const) : presence, threshold };
   }
 
-  /** Whether what is selected may have the color and the name that a phrase tells of it; true if no color is told or known. */
+  /** Whether what is selected may have the color and the name that a phrase tells; true if no color or quality is told. */
   #hasColor(phrase: string, splats: number[], share: number): boolean {
     const { grammar } = this.dictionary;
     const told = this.#colorsTold(phrase);
     const holding = this.kinds.holding(splats, share);
-    const seen = holding.flatMap((entry) => entry.seen_colors ?? []);
-    if (told.length === 0 || seen.length === 0) return true;
-    const isNamed = (name: string): boolean => name.split(" ").at(-1) === phrase.toLowerCase().split(" ").at(-1);
+    const [last, ...before] = phrase.toLowerCase().split(" ").reverse();
+    if (holding.length === 0 || (told.length === 0 && !before.some((word) => grammar.has("qualities", word)))) return true;
+    const isNamed = (name: string): boolean => name.split(" ").at(-1) === last;
     if (this.kinds.names.some(isNamed) && !holding.some(({ name }) => isNamed(name))) return false;
+    if (told.length === 0) return true;
+    const seen = holding.flatMap((entry) => entry.seen_colors ?? []);
     const pairs = [...told.map((color) => [color, color]), ...grammar.list("near_colors").map((pair) => pair.split(" "))];
-    return pairs.some(([a, b]) => (told.includes(a) && seen.includes(b)) || (told.includes(b) && seen.includes(a)));
+    if (!pairs.some(([a, b]) => (told.includes(a) && seen.includes(b)) || (told.includes(b) && seen.includes(a)))) return false;
+    const whole = this.kinds.covered(splats).map((place) => this.kinds.entry(place)); // not only a part: a light belly
+    return holding.some((entry) => whole.includes(entry) || told.some((color) => entry.colors?.includes(color)));
   }
 
   /** The colors that a phrase tells of a thing. */

@@ -20,6 +20,7 @@ from lexsplat.queries.phrases import (
     Colored,
     Every,
     Except,
+    Having,
     InCorner,
     InPart,
     Phrase,
@@ -256,16 +257,38 @@ def _except(phrase: Except, searched: Searched) -> Selection:
     return _joined(first, tuple(kept))
 
 
+def _having(phrase: Having, searched: Searched) -> Selection:
+    """The things that have a part; where no part is found, those that the whole phrase selects."""
+    targets, parts = answer(phrase.target, searched), answer(phrase.reference, searched)
+    things, found = _certain(targets), _certain(parts)
+    if found:
+        having = _owners(things, found)
+        present = min(targets.present, parts.present, key=PRESENCES.index)
+    else:
+        whole = searched.select(phrase.text)
+        taken = whole.mask if whole.present != "no" else torch.zeros_like(whole.mask)
+        having = {n for n, each in enumerate(things) if int(taken[each.indices].sum()) > _WHOLE * len(each)}
+        present = min(targets.present, whole.present, key=PRESENCES.index)
+    kept = tuple(each for number, each in enumerate(things) if number in having)
+    notes = "; ".join(dict.fromkeys(filter(None, (targets.note, parts.note if kept else ""))))
+    return replace(_joined(targets, kept, present), note=notes)
+
+
 def _without_any(things: list[Selection], parts: list[Selection]) -> list[Selection]:
-    """The things that have none of some parts; a part is that of the thing it is in, or else of the nearest one."""
+    """The things that have none of some parts."""
+    having = _owners(things, parts)
+    return [each for number, each in enumerate(things) if number not in having]
+
+
+def _owners(things: list[Selection], parts: list[Selection]) -> set[int]:
+    """The numbers of the things that have parts; a part is that of the thing it is in, or else of the nearest one."""
 
     def owner(part: Selection) -> int:
         inside = [int(each.mask[part.indices].sum()) for each in things]
         apart = [float(np.linalg.norm(each.center - part.center)) for each in things]
         return int(np.argmax(inside) if max(inside) else np.argmin(apart))
 
-    having = {owner(part) for part in parts} if things else set()
-    return [each for number, each in enumerate(things) if number not in having]
+    return {owner(part) for part in parts} if things else set()
 
 
 def _pick(phrase: Pick, searched: Searched) -> Selection:
@@ -324,7 +347,8 @@ def _viewer(phrase: Viewer, searched: Searched) -> Selection:
 
 _ANSWERS: dict[type, Callable[..., Selection]] = {
     Anything: _anything, Colored: _colored, Related: _related, Between: _between, InCorner: _corner, InPart: _part,
-    Both: _both, Together: _both, Except: _except, Pick: _pick, AtLeast: _at_least, Every: _every, Viewer: _viewer,
+    Both: _both, Together: _both, Except: _except, Having: _having, Pick: _pick, AtLeast: _at_least, Every: _every,
+    Viewer: _viewer,
 }  # fmt: skip
 
 

@@ -17,6 +17,7 @@ two apples                           all of them, if there are as many; "exactly
 second toy from the left             by its place in an order; also "3 nearest things to the mug"
 is the bear bigger than the duck?    by boxes; "which is bigger, A or B?" is the largest of both
 things at the back of the table      a part of an area; also "in the middle", "at the edge"
+mug with a handle                    the mug, if it has one (`having`)
 is there an apple and a cat?         both, else nothing; "is everything on the cloth?": all, else nothing
 mug that is blue; is the mug blue?   the same as "blue mug"; "made of metal" as well
 what is on the cloth?                any object; also "thing", "object", "everything"
@@ -36,6 +37,7 @@ import string
 from dataclasses import replace
 
 from lexsplat.queries import patterns
+from lexsplat.queries.having import thing_of, unseen
 from lexsplat.queries.phrases import (
     ORDERED,
     Anything,
@@ -96,7 +98,6 @@ from lexsplat.queries.wording import (
     number,
     own_words,
     picked,
-    thing_of,
     undetermined,
 )
 from lexsplat.runtime.errors import QueryError
@@ -137,10 +138,11 @@ def understand(text: str) -> Understood:
         quote = own_words(str(incomplete), plain)
         note = f'not understood ("{quote}"): asked for as one thing, in these words'
     else:
-        unknown = unknown or (bool(parser.notes) and parser.stated)  # is the mug big?
+        unlooked = unseen(parsed, plain)
+        unknown = unknown or bool(unlooked) or (bool(parser.notes) and parser.stated)  # is the mug big?
         told = (
             mended_note(mended),
-            *dict.fromkeys(parser.notes + parser.asides),
+            *dict.fromkeys(parser.notes + parser.asides + unlooked),
             command_note(asked),
             aside,
             moment,

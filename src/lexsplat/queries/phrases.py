@@ -160,6 +160,24 @@ class Except:
 
 
 @dataclass(frozen=True)
+class Having:
+    """The instances of ``target`` that have an instance of ``reference``, a part: "mug with a handle".
+
+    Args:
+        target: The things.
+        reference: The part: "mug handle".
+        text: The whole phrase, which is asked for where no part is found.
+    """
+
+    target: Phrase
+    reference: Phrase
+    text: str = field(default="", compare=False)
+
+    def __str__(self) -> str:
+        return f"({self.target} with {self.reference})"
+
+
+@dataclass(frozen=True)
 class Pick:
     """One instance of several, or ``count`` of them from the one with the number ``rank`` on."""
 
@@ -211,6 +229,7 @@ Phrase = Union[  # noqa: UP007  (forward references)
     Both,
     Together,
     Except,
+    Having,
     Pick,
     AtLeast,
     Every,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from lexsplat.queries import leftovers, patterns, questions
+from lexsplat.queries import having, leftovers, patterns, questions
 from lexsplat.queries.colors import COLOR_WORDS, NEAR
 from lexsplat.queries.kinds import KIND_PHRASES
 from lexsplat.queries.meaning import known_words
@@ -32,7 +32,7 @@ def page_grammar(clip: str = "") -> dict[str, Any]:
         clip: Name of the encoder of the scene, some of whose words the page splits and joins.
     """
     found = {name.lower(): getattr(patterns, name) for name in _OF_THE_GRAMMAR}
-    found |= {**questions.FOR_PAGES, **leftovers.FOR_PAGES, "which_of": _WHICH_OF}
+    found |= {**questions.FOR_PAGES, **leftovers.FOR_PAGES, **having.FOR_PAGES, "which_of": _WHICH_OF}
     return {
         "patterns": {name: _source(pattern) for name, pattern in found.items()},
         "replaced": {
