@@ -12,12 +12,12 @@ import torch
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.answering import Searched, answer
 from lexsplat.queries.grammar import understand
+from lexsplat.queries.having import thing_of
 from lexsplat.queries.kinds import with_unknown_words, words_of_things
 from lexsplat.queries.meaning import in_known_words, known_words
 from lexsplat.queries.phrases import Phrase, Thing, Understood, mended_note, things_of, with_things
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.spelling import spellings
-from lexsplat.queries.wording import thing_of
 from lexsplat.scenes.pixels import object_colors
 
 if TYPE_CHECKING:
