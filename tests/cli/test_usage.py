@@ -253,6 +253,7 @@ def test_a_build_whose_progress_nobody_reads_any_more_is_stopped_and_says_so(tin
     words = [
         "build", str(tiny_capture), "--output", str(tmp_path / "scene"),
         "--progress", "json", "--clip", "bundled", "--dino", "none", "--device", "cpu", "--iterations", "6",
+        "--downscale", "4",
     ]  # fmt: skip
     with Command(*words) as command:
         assert command.stdout.readline()

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from support import TESTS_ON_PATH
+from support import killed_builds
+from support.forked_commands import Command
 from support.killed_builds import KILLS_A_SCENE
 from support.tiny_capture import write_capture
 
@@ -44,11 +42,10 @@ def killed(tmp_path_factory) -> dict[str, dict]:
         "--iterations", "60", "--codebook.num-codes", "16", "--trained.iterations", "30",
         "--checkpoint-seconds", "0.05",
     ]  # fmt: skip
-    command = [sys.executable, "-m", "support.killed_builds", str(folder), json.dumps(STAGES), *options]
-    environment = {**os.environ, **TESTS_ON_PATH, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
-    run = subprocess.run(command, capture_output=True, text=True, timeout=900, env=environment)
-    assert run.returncode == 0, run.stderr[-2000:]
-    return json.loads(run.stdout.splitlines()[-1])
+    with Command(str(folder), json.dumps(STAGES), *options, program=killed_builds.main) as killing:
+        ended = killing.ended(seconds=900)
+    assert ended.status == 0, ended.err[-2000:]
+    return json.loads(ended.out.splitlines()[-1])
 
 
 def results(scene: Path) -> dict[str, bytes]:

@@ -19,6 +19,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from lexsplat.__main__ import main
 from support.warm_starts import Ended
 
 Streams = tuple[int, int, int]
@@ -26,10 +27,11 @@ Streams = tuple[int, int, int]
 
 
 class Command:
-    """``lexsplat WORDS`` in a fork; standard error goes to a file.
+    """``lexsplat WORDS``, or another program with these words, in a fork; standard error goes to a file.
 
     Args:
         *words: The command and its arguments.
+        program: What is run.
         encoding: Of its standard streams.
         heard: Whether standard output has a reader.
         prepare: What the fork does before the command.
@@ -38,6 +40,7 @@ class Command:
     def __init__(
         self,
         *words: str,
+        program: Callable[[], int | None] = main,
         encoding: str = "utf-8",
         heard: bool = True,
         prepare: Callable[[], object] = lambda: None,
@@ -53,7 +56,7 @@ class Command:
             os.close(our_in)
             if heard:
                 os.close(our_out)
-            _run(words, (their_in, their_out, self._errors.fileno()), encoding, prepare)
+            _run(words, program, (their_in, their_out, self._errors.fileno()), encoding, prepare)
         os.close(their_in)
         os.close(their_out)
 
@@ -128,7 +131,7 @@ def startable(*words: str) -> Iterator[list[str]]:
             connection, _ = listening.accept()
             _, streams, _, _ = socket.recv_fds(connection, 1, 3)
             told = lambda status: connection.send(str(status).encode())  # noqa: E731
-            _run(words, (streams[0], streams[1], streams[2]), "utf-8", lambda: None, told)
+            _run(words, main, (streams[0], streams[1], streams[2]), "utf-8", lambda: None, told)
         try:
             yield [sys.executable, "-I", "-S", "-c", _RELAY, place]
         finally:
@@ -139,12 +142,13 @@ def startable(*words: str) -> Iterator[list[str]]:
 
 def _run(
     words: tuple[str, ...],
+    program: Callable[[], int | None],
     streams: Streams,
     encoding: str,
     prepare: Callable[[], object],
     told: Callable[[int], object] = lambda status: None,
 ) -> None:
-    """Run a command on these standard streams, and end the process."""
+    """Run a program on these standard streams, and end the process."""
     status = 1
     try:
         for number, stream in enumerate(streams):
@@ -160,9 +164,7 @@ def _run(
         os.environ["TOKENIZERS_PARALLELISM"] = "false"  # else it warns of forks
         prepare()
         sys.argv = ["lexsplat", *words]
-        from lexsplat.__main__ import main
-
-        status = main()
+        status = program() or 0
         for thread in threading.enumerate():
             if thread is not threading.current_thread() and not thread.daemon:
                 thread.join()

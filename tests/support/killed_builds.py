@@ -1,9 +1,9 @@
 """Repeats a build in processes that are killed, until the scene is finished.
 
-test_killed_builds.py runs this module in a separate process, with one thread and without a GPU. By each method it
-builds the scene once undisturbed, and every further attempt is a fork: no module is imported and no kernel is loaded
-again. No thread is left at the forks. The first kill of a scene strikes inside one of the stages, at a progress
-event; the others strike at random moments.
+test_killed_builds.py runs this module in a fork, where torch has one thread. By each method it builds the scene once
+undisturbed, and every further attempt is a fork: no module is imported and no kernel is loaded again. No thread is
+left at the forks. The first kill of a scene strikes inside one of the stages, at a progress event; the others strike
+at random moments.
 """
 
 from __future__ import annotations
@@ -101,7 +101,3 @@ def main() -> None:
     folder, methods, *options = sys.argv[1:]
     stages = json.loads(methods)
     print(json.dumps({m: killed(Path(folder) / m, m, names, options) for m, names in stages.items()}))
-
-
-if __name__ == "__main__":
-    main()

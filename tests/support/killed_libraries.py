@@ -1,7 +1,7 @@
 """Adds scenes to a library and removes them in processes that are killed at random moments.
 
-test_killed_libraries.py runs this module in a separate process: it imports everything once, and every attempt is a
-fork. No threads are started before the forks. After each kill the library is checked: every scene that was in it and
+test_killed_libraries.py runs this module in a fork, in which every attempt is a fork: nothing is imported again. No
+threads are started before the forks. After each kill the library is checked: every scene that was in it and
 was not being changed is there with the same bytes, and the next attempt begins where this one ended.
 """
 
@@ -90,7 +90,3 @@ def main() -> None:
             report["failed"].append(f"add {place.name} at the end")
     report["files"] = sorted(path.name.split(".")[0] for path in (library / "scenes").iterdir())
     print(json.dumps(report))
-
-
-if __name__ == "__main__":
-    main()
