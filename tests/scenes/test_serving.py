@@ -212,8 +212,8 @@ def test_a_prompt_has_one_presence_whatever_asks_it_and_in_any_order(served_demo
 
 def test_words_in_quotation_marks_have_no_grammar_that_could_make_them_unsure(served_demo):
     scene = served_demo.scene
-    assert scene.find('"the third teddy bear"').present == "yes"
-    assert scene.ask("the third teddy bear").presences == ("unsure",)
+    assert scene.find('"the third toy car"').present == "yes"
+    assert scene.ask("the third toy car").presences == ("unsure",)
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,7 @@ COMMANDS = {
     "find": CommandEntry("find", "Find", "where things are in 3D, how many and how large"),
     "list": CommandEntry("listing", "List", "everything in a scene: names, colors, places and sizes"),
     "ask": CommandEntry("ask", "Ask", "questions in your own words, many a second with --stdin"),
+    "measure": CommandEntry("measure", "Measure", "how far two things are from each other"),
     "scale": CommandEntry("scale", "Scale", "set the length of a meter and the up direction of a scene"),
     "evaluate": CommandEntry("evaluate", "Evaluate", "measure a scene on its held-out views"),
     "ablate": CommandEntry("ablate", "Ablate", "measure the method without its parts"),
@@ -61,7 +62,7 @@ _REMEDIES = {
 }
 """Remedies for errors of the system, by their numbers."""
 
-_PRINTING = ("query", "find", "list", "ask", "library", "encoders", "info")
+_PRINTING = ("query", "find", "list", "ask", "measure", "library", "encoders", "info")
 """Commands that have nothing left to do but to print when they begin to."""
 
 _UNSUITABLE = {
@@ -170,7 +171,7 @@ def _run(words: list[str]) -> int:
 
 
 def _flush() -> None:
-    """Write what is left of the output: `main` is to notice a reader that has ended before the interpreter does."""
+    """Write what is left of the output, so that `main`, not the interpreter, notices a reader that has ended."""
     if sys.stdout is not None:  # None if it is closed, as in `lexsplat info SCENE >&-`
         sys.stdout.flush()
 

@@ -118,7 +118,7 @@ def of_part(scene: Scene, prompt: str, word: Word) -> Word:
     name = thing_of_part(prompt)
     if not name:
         return word
-    found = scene.ask(name)
+    found = scene.ask(name, checked=True)
     thing = found.chosen(0)
     if found.presences[0] == "no" or int(thing.sum()) < FEWEST:
         return word
