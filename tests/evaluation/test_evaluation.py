@@ -181,14 +181,12 @@ def test_automatic_thresholds_are_those_of_the_scene_and_not_rounded(capture, ga
 
     def ask_precisely(self, prompts, **options):
         found = ask(self, prompts, **options)
-        if options:  # of another thing, on the way
-            return found
-        seen.append(replace(found, thresholds=torch.tensor([0.1234567, 0.7654321])))
+        seen.append(replace(found, thresholds=torch.tensor([0.1234567, 0.7654321])[: len(found.prompts)]))
         return seen[-1]
 
     monkeypatch.setattr(Scene, "ask", ask_precisely)
     found = evaluate(capture, scene, QUICK).thresholds
-    (answers,) = seen
+    answers = seen[0]  # the maps of views ask the same again
     assert [found[prompt]["auto"] for prompt in answers.prompts] == answers.thresholds.tolist()
 
 
