@@ -75,8 +75,11 @@ _NUMBER = re.compile(
 )
 """Numbers, but not the one at the end of a name: "room 101"."""
 _UNIT = re.compile(
-    r"^(?:(?:centi|milli|kilo)?met(?:er|re)s?|cm|mm|km|inch(?:es)?|feet|foot|yards?) of\b", re.IGNORECASE
+    r"^(?:(?:centi|milli|kilo)?met(?:er|re)s?|cm|mm|km|inch(?:es)?|feet|foot|yards?) of\b|"
+    r"^(?:distance|height|width|weight|volume|position|location)(?:$| (?:of|between|from|to)\b)",
+    re.IGNORECASE,
 )
+"""What is measured, and in which unit."""
 _FIXED = re.compile(
     rf"\b(?:{'|'.join(sorted(COLORS))}),? and (?=(?:{'|'.join(sorted(COLORS))})\b)|"
     rf"\b(?:with|of) (?:no|\d+|{'|'.join(NUMBERS)}) (?=\w)|\b(?:made|built)(?: out)? of\b|\bfirst aid\b|"
