@@ -340,7 +340,8 @@ function doubtful<T extends Answer | null>(answer: T, note: string): T {
 function unread(answer: Answer | null, note: string): Answer | null {
   const told = doubtful(answer, note);
   if (told?.presence !== "no") return told;
-  return { ...told, presence: "unsure", scores: new Float32Array(told.scores.length), own: null, places: [], members: null };
+  const scores = told.scores.map((score) => Math.min(score, told.threshold - 1e-4)); // nothing is painted
+  return { ...told, presence: "unsure", scores, own: null, places: [], members: null };
 }
 
 /** Places without those that are mostly in an earlier one. */
