@@ -22,7 +22,7 @@ from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.journal import Step
 from lexsplat.scenes.recoloring import recolored
 from lexsplat.scenes.scene import Scene, open_scene
-from lexsplat.scenes.views import StoredView
+from lexsplat.scenes.views import PhotoLens, StoredView
 
 
 @pytest.fixture(scope="module")
@@ -276,7 +276,11 @@ def test_a_step_survives_json(base):
 def test_a_saved_edit_is_a_scene(base, tmp_path):
     scene, labels = base
     folder = SceneFolder(tmp_path / "scene")
-    folder.write_cameras({name: (view.camera, view.split) for name, view in scene.views.items()})
+    lens = PhotoLens("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.1))
+    lensed = next(iter(scene.views))
+    folder.write_cameras(
+        {name: (view.camera, view.split) for name, view in scene.views.items()}, {lensed: lens}
+    )
     folder.write_gaussians(scene.gaussians)
     write_field(scene.field, {"reconstruction": "f"}, folder.language_path)
     folder.finish("reconstruct", "f", 1.0, gaussians=150)
@@ -288,6 +292,7 @@ def test_a_saved_edit_is_a_scene(base, tmp_path):
     assert torch.equal(saved.gaussians.means, scene.gaussians.means[labels != 0])
     assert saved.field.codes[:, 0].tolist() == labels[labels != 0].tolist()
     assert saved.folder.record["edits"] == ["delete balls (0,) (30 Gaussians)"]
+    assert {name: view.photo for name, view in saved.views.items() if view.photo} == {lensed: lens}
     with pytest.raises(SceneFolderError, match="exists"):
         editor.save(tmp_path / "saved")
 

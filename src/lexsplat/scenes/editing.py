@@ -274,7 +274,11 @@ class Editor:
         stages, record["stages"] = record["stages"], {}
         folder.record = record
         output.mkdir(parents=True)
-        folder.write_cameras({name: (view.camera, view.split) for name, view in self.scene.views.items()})
+        views = self.scene.views
+        folder.write_cameras(
+            {name: (view.camera, view.split) for name, view in views.items()},
+            {name: view.photo for name, view in views.items() if view.photo},
+        )
         folder.write_gaussians(self.scene.gaussians)
         reconstruction = stages.get("reconstruct", {}).get("fingerprint")
         with atomic_path(folder.language_path) as temporary:

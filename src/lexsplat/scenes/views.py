@@ -62,7 +62,7 @@ class StoredView:
         name: Name of the photo, relative to the image folder.
         camera: The pinhole camera of the view: that of the photo after undistortion, at the size of the scene.
         split: "train" or "test".
-        photo: The lens of the photo; None in scenes that were built before lenses were kept, and in saved edits.
+        photo: The lens of the photo; None in scenes that were built before lenses were kept.
     """
 
     name: str
@@ -93,7 +93,7 @@ class StoredView:
             raise QueryError(
                 f"view {self.name[:60]!r}",
                 expected="the lens of its photo",
-                found="none: the scene was built before lenses were kept, or is a saved edit",
+                found="none: the scene was built before lenses were kept",
                 remedy="build the scene again (finished stages are kept), and ask that one",
             )
         rays = np.ones((given.size // 2, 3))
