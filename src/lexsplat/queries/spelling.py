@@ -83,7 +83,7 @@ def strange(phrase: str, vocabulary: Iterable[str]) -> list[str]:
     ]
 
 
-def _is_known(word: str, known: set[str]) -> bool:
+def _is_known(word: str, known: Set[str]) -> bool:
     small = word.lower()
     if not (small.isascii() and small.isalpha()):
         return small in known
@@ -133,8 +133,13 @@ def frame_errors(text: str, frame: Set[str], vocabulary: Set[str], known: Set[st
     return found
 
 
-def _words_of(phrases: Iterable[str]) -> set[str]:
-    return {word.lower() for entry in phrases for word in entry.split()}
+def _words_of(phrases: Iterable[str]) -> frozenset[str]:
+    return _split(tuple(phrases))
+
+
+@lru_cache(16)
+def _split(phrases: tuple[str, ...]) -> frozenset[str]:
+    return frozenset(word.lower() for entry in phrases for word in entry.split())
 
 
 def _is_typed_wrong(word: str) -> bool:
@@ -142,7 +147,7 @@ def _is_typed_wrong(word: str) -> bool:
     return len(word) > 2 and word.isascii() and word.isalpha() and not word.isupper() and not is_word(word)
 
 
-def _meant(word: str, known: set[str]) -> Sequence[str]:
+def _meant(word: str, known: Set[str]) -> Sequence[str]:
     """Corrections of a word, the likeliest first."""
     small = word.lower()
     if len(small) < 3 or small in known or not small.isalpha() or _singular_word(small) in known:

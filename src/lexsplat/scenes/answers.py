@@ -6,6 +6,7 @@ import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -208,6 +209,7 @@ def answer_queries(
     }
 
 
+@lru_cache(256)
 def in_own_words(prompt: str, clip: str) -> Understood:
     """How a prompt is understood that is asked in its own words.
 
