@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lexsplat import cli
-from lexsplat.queries.colors import unqualified, without_color
+from lexsplat.queries.colors import is_qualified, unqualified, without_color
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.listed import listed_as, refuse_doubtful
@@ -40,6 +40,12 @@ def listed(scene: Scene, name: str):
 )
 def test_a_phrase_loses_its_colors_and_qualities_with_what_joins_them(phrase, plain, bare):
     assert (without_color(phrase), unqualified(phrase)) == (plain, bare)
+    assert is_qualified(phrase) == (bare != phrase)
+
+
+def test_an_article_is_no_quality():
+    assert unqualified("the third mug") == "third mug"
+    assert not is_qualified("the third mug")
 
 
 @pytest.mark.parametrize(

@@ -78,6 +78,12 @@ def without_color(phrase: str) -> str:
     return _without(phrase, color_told(phrase))
 
 
+def is_qualified(phrase: str) -> bool:
+    """Whether a phrase tells a color, a material or the like of a thing."""
+    before = phrase.lower().replace("grey", "gray").split()[:-1]
+    return not QUALITIES.isdisjoint(before)
+
+
 def unqualified(phrase: str) -> str:
     """A phrase without articles, and without colors, materials and the like: "duck" of "the metal duck"."""
     return _without(phrase, QUALITIES | _ARTICLES)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from lexsplat.queries.colors import color_told, may_be, unqualified
+from lexsplat.queries.colors import color_told, is_qualified, may_be
 from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.part_names import DOUBTFUL, is_doubtful
 from lexsplat.queries.parts import FEWEST, part_scores, with_parts
@@ -147,7 +147,7 @@ def of_qualities(scene: Scene, prompt: str, word: Word) -> Word:
     answer, whatever they say.
     """
     told = color_told(prompt)
-    if not (told or unqualified(prompt) != prompt) or form_used(scene.field, scene.query) != "segment":
+    if not is_qualified(prompt) or form_used(scene.field, scene.query) != "segment":
         return word
     if not scene.field.segments:
         return word
