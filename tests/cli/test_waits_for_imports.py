@@ -20,6 +20,7 @@ WORDS = {
     "find": ["demo", "red apple"],
     "list": ["demo"],
     "ask": ["demo", "where is the mug?"],
+    "measure": ["demo", "mug", "banana"],
     "scale": ["scene", "--distance", "1", "--height-of", "mug"],
     "evaluate": ["scene", "--capture", "demo"],
     "ablate": ["demo", "--output", "new", "--iterations", "1"],

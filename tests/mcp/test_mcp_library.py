@@ -52,7 +52,7 @@ def test_a_search_reports_what_it_did_not_understand_or_corrected(server):
     reply, text = ask(server, "search_library", phrase="why is the sky blue")
     document = reply.structured_content
     validated("library", {"library": "x", "phrases": [document]})
-    assert (document["present"], document["hits"]) == ("no", [])
+    assert (document["present"], document["hits"]) == ("unsure", [])
     assert "not understood" in document["note"]
     assert text == f'In no scene: nothing fits "why is the sky blue". Note: {document["note"]}.'
     reply, text = ask(server, "search_library", phrase="bananna")

@@ -333,7 +333,8 @@ class LibraryTools(Tools):
         elif not found.scenes and not found.skipped:
             text = "The library holds no scene."
         else:
-            where = "no scene that could be asked" if found.present == "unsure" else "no scene"
+            unasked = found.present == "unsure" and (found.skipped or found.unopened)
+            where = "no scene that could be asked" if unasked else "no scene"
             text = f"In {where}: nothing fits {shortened(found.understood)}."
         note = f" Note: {found.note}." if found.note else ""
         more = f" {counted(found.unopened, 'more scene')} may hold it." if found.unopened else ""
