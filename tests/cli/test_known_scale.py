@@ -4,25 +4,18 @@ import csv
 import io
 import json
 import re
-import shutil
 
 import pytest
+from support.scaled_demo import METERS, scaled_demo
 from support.schemas import validated
 
 from lexsplat import cli, open_scene
-from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
-from lexsplat.scenes.scale import store_world
-
-METERS = 0.25
-"""Meters in a unit of the scene."""
 
 
 @pytest.fixture(scope="module")
 def scaled(tmp_path_factory) -> str:
     """A copy of the scene that ships, with a known scale."""
-    folder = shutil.copytree(BUNDLED_SCENE, tmp_path_factory.mktemp("known") / "scene")
-    store_world(SceneFolder.open(folder), meters_per_unit=METERS)
-    return str(folder)
+    return scaled_demo(tmp_path_factory.mktemp("known") / "scene")
 
 
 @pytest.fixture(scope="module")

@@ -1,27 +1,20 @@
 """``lexsplat measure``: lengths between two things of the bundled scene, compared with their boxes and points."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
 from support.command_line import fails_in_one_line
+from support.scaled_demo import METERS, scaled_demo
 from support.schemas import validated
 
 from lexsplat import cli, open_scene
 from lexsplat.queries.selection import Selection
-from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
-from lexsplat.scenes.scale import store_world
-
-METERS = 0.25
-"""Meters in a unit of the copy."""
 
 
 @pytest.fixture(scope="module")
 def scaled(tmp_path_factory) -> str:
-    folder = shutil.copytree(BUNDLED_SCENE, tmp_path_factory.mktemp("known") / "scene")
-    store_world(SceneFolder.open(folder), meters_per_unit=METERS)
-    return str(folder)
+    return scaled_demo(tmp_path_factory.mktemp("known") / "scene")
 
 
 @pytest.fixture(scope="module")

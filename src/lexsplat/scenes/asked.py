@@ -66,5 +66,5 @@ def both(first: Mapping[str, Any], second: Mapping[str, Any], link: str, view: s
 
 
 def joined(*notes: str) -> str:
-    """Notes as one; each is told once."""
+    """The notes in one line, without repetitions."""
     return "; ".join(dict.fromkeys(filter(None, notes)))
