@@ -123,15 +123,16 @@ def _cut(lowest: FloatArray, lowest_masses: FloatArray, level: NDArray[np.int64]
     sums = np.stack([_sums(level, row, count) for row in lowest])
     scores = sums / np.maximum(masses, 1e-12)
     order = np.argsort(-scores, axis=1, kind="stable")
-    ranked = np.take_along_axis(scores, order, 1)
+    rows = np.arange(len(scores))
+    ranked = scores[rows[:, None], order]
     if count == 1:
         return _Cut(scores, masses, np.zeros(len(scores)), ranked[:, 0], ranked[:, 0], np.zeros(len(scores)))
     gaps = np.where(ranked[:, :-1] >= LOWEST * ranked[:, :1], ranked[:, :-1] - ranked[:, 1:], -1.0)
-    best = gaps.argmax(1)[:, None]
-    limits = (np.take_along_axis(ranked[:, :-1], best, 1) + np.take_along_axis(ranked[:, 1:], best, 1)) / 2
-    taken = scores >= limits
+    best = gaps.argmax(1)
+    limits = (ranked[rows, best] + ranked[rows, best + 1]) / 2
+    taken = scores >= limits[:, None]
     means = [(sums * side).sum(1) / np.maximum((masses * side).sum(1), 1e-12) for side in (taken, ~taken)]
-    return _Cut(scores, masses, np.take_along_axis(gaps, best, 1)[:, 0], limits[:, 0], *means)
+    return _Cut(scores, masses, gaps[rows, best], limits, *means)
 
 
 def _sums(places: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:

@@ -91,7 +91,7 @@ def _if_visible(scene: Scene, word: Word) -> Word:
     if word.presence == "no" or form_used(scene.field, scene.query) != "segment":
         return word
     taken = (word.scores >= BORDER) & ~scene.hidden
-    faint = bool(taken.any()) and float(scene.gaussians.opacities[taken].mean()) < FAINT
+    faint = bool(taken.any()) and float(scene.gaussians.opacity_logits[taken].sigmoid().mean()) < FAINT
     return replace(word, presence="no") if faint else word
 
 
@@ -133,8 +133,9 @@ def _is_doubtful(scene: Scene, prompt: str, word: Word) -> bool:
     segments, taken = scene.field.segments, ((word.scores >= BORDER) & ~scene.hidden).nonzero()[:, 0]
     if word.presence != "yes" or segments is None or not len(taken):
         return False
-    probabilities, shown = scene.field.select(taken).code_probabilities(), segments.masses[taken]
-    place = shown.to(probabilities) @ probabilities / shown.sum().clamp_min(1e-12)
+    shown = segments.masses[taken]
+    sums = torch.from_numpy(scene.field.select(taken).sums(torch.zeros_like(taken), shown, 1)[0]).float()
+    place = sums.to(shown) / shown.sum().clamp_min(1e-12)
     return is_doubtful(part_named(prompt), place, scene.presence_classifier.part_fits)
 
 
