@@ -1,6 +1,7 @@
 """``lexsplat measure``: lengths between two things of the bundled scene, compared with their boxes and points."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from support.schemas import validated
 
 from lexsplat import cli, open_scene
 from lexsplat.queries.selection import Selection
+from lexsplat.scenes.folder import BUNDLED_SCENE
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +59,15 @@ def test_lengths_are_printed_in_scene_units_and_in_meters_where_they_are_known(
     out = printed(capsys, "demo", "mug", "banana")
     assert f"between their centers: {apart:.3f} scene units\n" in out
     assert " m " not in out
+
+
+def test_the_command_for_meters_is_told_where_it_can_be_run(tmp_path, capsys):
+    own = tmp_path / "a scene"
+    shutil.copytree(BUNDLED_SCENE, own)
+    assert cli.main(["measure", str(own), "mug", "banana"]) == 0
+    assert f"see lexsplat scale '{own}' --help" in capsys.readouterr().err
+    assert cli.main(["measure", "demo", "mug", "banana"]) == 0
+    assert "lexsplat scale" not in capsys.readouterr().err, "the bundled scene is never written"
 
 
 def test_of_several_things_the_nearest_pair_is_named(capsys):

@@ -54,7 +54,9 @@ class Measure:
             print_json(document)
             return
         _print_lengths(document)
-        if document["meters_per_unit"] is None:
+        # The bundled scene is never written, so nobody can give it a scale.
+        bundled = scene.folder is not None and scene.folder.is_bundled
+        if document["meters_per_unit"] is None and not bundled:
             told = f"one known distance gives meters; see lexsplat scale {quote(self.scene)} --help"
             print(f"note: {told}", file=sys.stderr)
 
