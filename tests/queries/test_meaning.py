@@ -5,19 +5,23 @@ import pytest
 from lexsplat.queries.grammar import understand
 from lexsplat.queries.meaning import compounds, in_known_words, known_words
 from lexsplat.queries.phrases import Thing, own_words_of
+from lexsplat.queries.selection import Presence
 
 KNOWN = frozenset({"lamp", "shade", "flower", "pot", "cup", "board", "table", "cloth", "tablecloth", "red"})
 
 
-def asked(text: str, here: set[str], own: str = "", exact: bool = False) -> str:
-    thing = Thing(text, own=own, exact=exact)
-    return in_known_words(thing, lambda words: "yes" if words in here else "no", KNOWN)
+def asked(text: str, here: set[str], own: str = "", exact: bool = False, unsure: str = "") -> str:
+    def presence_of(words: str) -> Presence:
+        return "yes" if words in here else "unsure" if words == unsure else "no"
+
+    return in_known_words(Thing(text, own=own, exact=exact), presence_of, KNOWN)
 
 
 def test_a_plural_counts_as_it_was_typed_where_only_that_is_here():
     assert asked("leaf", {"leaves"}, own="leaves") == "leaves"
     assert asked("leaf", {"leaf", "leaves"}, own="leaves") == "leaf"
     assert asked("leaf", set(), own="leaves") == "leaf"
+    assert asked("leaf", {"leaves"}, own="leaves", unsure="leaf") == "leaf"
 
 
 @pytest.mark.parametrize(
@@ -39,6 +43,7 @@ def test_a_compound_word_is_asked_for_as_its_two_words_where_both_and_the_last_a
     assert asked("cupboard", {"cup board", "cup"}) == "cupboard", "a cup is no board"
     assert asked("lampshade", {"lampshade", "lamp shade", "shade"}) == "lampshade"
     assert asked("lampshade", {"lamp shade", "shade"}, exact=True) == "lampshade"
+    assert asked("lampshade", {"lamp shade", "shade"}, unsure="lampshade") == "lamp shade"
 
 
 def test_two_words_are_asked_for_as_one_that_is_known():

@@ -125,9 +125,9 @@ export class Tables implements Source {
     return doubtful(answer, `the bundled encoder knows English words alone, not ${listed}`);
   }
 
-  /** What is not here, with a compound word split or joined where the scene holds that (lexsplat.queries.meaning). */
+  /** What is not surely here, with a compound word split or joined where the scene holds that (lexsplat.queries.meaning). */
   async #inOtherWords(answer: Answer | null, text: string, prompt: string, color: string): Promise<Answer | null> {
-    if (answer?.presence !== "no") return answer;
+    if (!answer || answer.presence === "yes") return answer;
     const phrase = this.spelling?.singular(text) ?? text;
     const isHere = async (words: string): Promise<Answer | null> => {
       const found = await this.#plain(words, prompt, color, true);

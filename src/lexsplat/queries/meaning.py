@@ -1,4 +1,4 @@
-"""Other words for the same thing, where a scene lacks the thing by its first words: plurals and compound words.
+"""Other words for the same thing, where a scene does not surely hold it by its first words: plurals and compound words.
 
 Encoders learn words as people write them. One may know "leaves" and not "leaf", "lamp shade" and not "lampshade".
 """
@@ -21,16 +21,19 @@ PresenceOf = Callable[[str], Presence]
 
 
 def in_known_words(thing: Thing, presence_of: PresenceOf, known: Set[str]) -> str:
-    """The words that a thing is asked for in: its text, or others that the scene holds where it lacks the text.
+    """The words that a thing is asked for in: its text, or others that the scene holds.
+
+    A compound word is replaced where the scene does not surely hold it, a singular where the scene lacks it.
 
     Args:
         thing: A thing; words in quotation marks stay.
         presence_of: The presence of words in the scene.
         known: Words that a compound word may be made of (`known_words`).
     """
-    others = [*([(thing.own, "")] if thing.own else []), *compounds(thing.text, known)]
-    if thing.exact or not others or presence_of(thing.text) != "no":
+    plural, written = [(thing.own, "")] if thing.own else [], [*compounds(thing.text, known)]
+    if thing.exact or not (plural or written) or (presence := presence_of(thing.text)) == "yes":
         return thing.text
+    others = [*plural, *written] if presence == "no" else written
     for words, head in others:
         if presence_of(words) == "yes" and (not head or presence_of(head) == "yes"):
             return words

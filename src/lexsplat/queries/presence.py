@@ -44,7 +44,7 @@ YES_SEGMENT, YES_COLORED, YES_PART = 0.62, 0.82, 0.52
 """The former at objects, whose means are lower than peaks; for phrases with a color, which share the color or the
 name with most of what they are confused with; and for parts where their thing is described. Chosen on the second
 scene, with the bundled encoder and three of ``benchmarks/web_like.py``; those of "no" with six of them."""
-NO_SEGMENT, NO_PART = 0.55, 0.45
+NO_SEGMENT, NO_PART = 0.5, 0.4
 """Lower borders of "no" at objects, for phrases without a color, and for parts where their thing is described."""
 AT_THING = 0.3
 """Strength of its thing at a place that may be a part of it."""

@@ -1,4 +1,4 @@
-"""`Scene.ask`: a prompt that the scene lacks, in other words for the same thing."""
+"""`Scene.ask`: a prompt that the scene does not surely hold, in other words for the same thing."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def in_words_that_fit(
 
 
 def _in_other_words(scene: Scene, prompt: str, understood: Understood, word: Word) -> Word:
-    """The answer to a prompt: its own, or where that is "no" the one to its singular, or to it as two words.
+    """The answer to a prompt: its own, or where that is no "yes" the one to it as two words, or to its plural.
 
     Only what is understood as a single thing has other words.
     """
     thing, has_grammar = understood.phrase, understood.note and not understood.unknown
-    if word.presence != "no" or has_grammar or not isinstance(thing, Thing) or thing.exact:
+    if word.presence == "yes" or has_grammar or not isinstance(thing, Thing) or thing.exact:
         return word
     one = Thing(prompt, own="" if thing.text == prompt else thing.text)
     asked = in_known_words(
