@@ -5,6 +5,7 @@ import torch
 from support.splats import solid
 
 from lexsplat.geometry.gaussians import SH_C0
+from lexsplat.queries import parts
 from lexsplat.queries.parts import part_scores, with_parts
 from lexsplat.queries.segments import SEGMENT_THRESHOLD
 
@@ -64,6 +65,49 @@ def test_a_part_may_be_most_of_its_thing():
     gaussians, places = bear()
     found = taken([0.1, 0.9, 0.1, 0.1, 0.9], gaussians, places)
     assert share(found, (places == HEAD) | (places == EARS)) > 0.9
+
+
+def mug():
+    """Gaussians of a white mug with a handle; and how near they are to the middle of the handle: 0 at its ends."""
+    rng = np.random.default_rng(0)
+    angle, height = rng.uniform(0, 2 * np.pi, 2500), rng.uniform(-1, 1, 2500)
+    body = np.stack([np.cos(angle), np.sin(angle), height], 1)
+    along, around = rng.uniform(-np.pi / 2, np.pi / 2, 400), rng.uniform(0, 2 * np.pi, 400)
+    wide = 0.6 + 0.1 * np.cos(around)
+    handle = np.stack([1.02 + wide * np.cos(along), 0.1 * np.sin(around), wide * np.sin(along)], 1)
+    near = np.concatenate([np.full(2500, -1.0), 1 - np.abs(along) / (np.pi / 2)])
+    return solid(np.concatenate([body, handle]), -3.0), near
+
+
+def test_a_part_grows_from_its_best_scores_to_where_it_meets_its_thing(monkeypatch):
+    gaussians, near = mug()
+    scores = np.array([0.2, 0.6, 0.9])[(near >= 0).astype(int) + (near > 0.6)]
+    scores += np.random.default_rng(1).normal(0, 0.02, len(near))
+    own, thing = torch.from_numpy(scores).float(), torch.ones(len(near), dtype=torch.bool)
+
+    def found() -> np.ndarray:
+        return (part_scores(own, thing, gaussians, thing.float()) >= SEGMENT_THRESHOLD).numpy()
+
+    assert share(found(), near >= 0) > 0.9
+    monkeypatch.setattr(parts, "NEAREST", 1.0)
+    assert share(found(), near >= 0) < 0.6, "without growing it is the middle alone"
+
+
+def test_a_part_does_not_grow_where_nothing_stops_it():
+    gaussians, places = bear()
+    head = gaussians.means[:, 2].numpy()
+    scores = np.where(places == TABLE, 0.1, np.where(head > 0.9, 0.9, 0.2 + 0.4 * np.clip(head, 0, 1)))
+    own, thing = torch.from_numpy(scores).float(), torch.from_numpy(places != TABLE)
+    grown = (part_scores(own, thing, gaussians, torch.ones(len(places))) >= SEGMENT_THRESHOLD).numpy()
+    assert (grown & (head < 0.6)).sum() == 0, "around the top of a ball each wider border is longer"
+
+
+def test_a_pixel_that_shows_a_part_for_the_most_part_shows_it():
+    gaussians, places = bear()
+    own = torch.from_numpy(np.array([0.1, 0.1, 0.75, 0.9, 0.1])[places]).float()
+    found = part_scores(own, torch.from_numpy(places != TABLE), gaussians, torch.ones(len(places)))
+    inside = found[found >= SEGMENT_THRESHOLD]
+    assert 0.7 * float(inside.min()) > SEGMENT_THRESHOLD
 
 
 def test_what_lies_outside_the_thing_is_no_part_of_it_however_it_scores():

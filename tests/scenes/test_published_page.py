@@ -95,9 +95,9 @@ def test_answers_are_those_of_python(page, demo):
         scores = np.frombuffer(base64.b64decode(answer["scores"]), np.float32)
         expected, near = asked.scores[number].numpy(), 0.02
         if thing_of_part(answer["phrase"]) or is_part_alone(answer["phrase"]):
-            # Rounded centers have other neighbors, and the scores of a part are stretched to 0..1.
+            # Rounded centers have other neighbors, which move the shortest border; scores of parts are stretched.
             assert np.quantile(np.abs(scores - expected), 0.999) <= 10 / 255, answer["prompt"]
-            near = 0.05
+            near = 0.08
             others = ((scores >= 0.5) != (expected >= 0.5)).sum()
             assert others <= near * (expected >= 0.5).sum(), answer["prompt"]
         else:

@@ -22,38 +22,73 @@ export function withParts(thing: number[], taken: number[], geometry: Geometry, 
  */
 export function partScores(own: Float32Array, thing: number[], geometry: Geometry, masses: Float64Array, rule: PartRule): Float32Array | null {
   const weights = Float64Array.from(thing, (i) => masses[i]);
-  const smooth = smoothed(Float64Array.from(thing, (i) => own[i]), thing, geometry, weights, rule);
+  const values = Float64Array.from(thing, (i) => own[i]);
+  const links = weighted(values, thing, geometry, weights, rule);
+  let smooth = values;
+  for (let round = 0; round < rule.rounds; round++) {
+    const before = smooth;
+    smooth = values.map((value, n) => (1 - rule.shared) * value + rule.shared * around(links[n], before));
+  }
   const found = cut(smooth, weights, rule);
   if (found.lowest >= rule.all) return null;
-  const { border, best } = found;
+  const { base, border, best } = found;
+  const part = grown(smooth, base, border, links, rule);
   const scores = Float32Array.from(own, (score) => (rule.outside * Math.min(score / border, 1)) / 2);
   thing.forEach((splat, n) => {
-    const inside = Math.min(Math.max((smooth[n] - border) / Math.max(best - border, 1e-6), 0), 1);
-    scores[splat] = (smooth[n] >= border ? 1 + inside : Math.min(smooth[n] / border, 1 - 1e-4)) / 2;
+    const inside = rule.firm + (1 - rule.firm) * Math.min(Math.max((smooth[n] - border) / Math.max(best - border, 1e-6), 0), 1);
+    scores[splat] = (part[n] ? 1 + inside : Math.min(smooth[n] / border, 1 - 1e-4)) / 2;
   });
   return scores;
 }
 
-/** Values averaged with those of neighbors of a like color and value. */
-function smoothed(values: Float64Array, thing: number[], geometry: Geometry, weights: Float64Array, rule: PartRule): Float64Array {
+type Link = [other: number, weight: number];
+
+/** The mean of numbers over the neighbors of a splat. */
+const around = (links: Link[], numbers: Float64Array): number => links.reduce((sum, [m, weight]) => sum + weight * numbers[m], 0);
+
+/** Links to neighbors, by how alike their colors and `values` are; those of a splat add up to 1. */
+function weighted(values: Float64Array, thing: number[], geometry: Geometry, weights: Float64Array, rule: PartRule): Link[][] {
   const { colors } = geometry;
-  const links = linked(thing, geometry.centers, rule.neighbors).map((others, n) =>
-    [...others].map((m): [number, number] => {
+  return linked(thing, geometry.centers, rule.neighbors).map((others, n) => {
+    const links = [...others].map((m): Link => {
       let apart = ((values[n] - values[m]) / rule.score) ** 2;
       for (let c = 0; c < 3; c++) apart += ((colors[3 * thing[n] + c] - colors[3 * thing[m] + c]) / rule.color) ** 2;
       return [m, Math.exp(-apart) * weights[m]];
-    }),
-  );
-  const totals = links.map((own) => Math.max(own.reduce((sum, [, weight]) => sum + weight, 0), 1e-9));
-  let smooth = values;
-  for (let round = 0; round < rule.rounds; round++) {
-    const before = smooth;
-    smooth = values.map((value, n) => {
-      const around = links[n].reduce((sum, [m, weight]) => sum + weight * before[m], 0) / totals[n];
-      return (1 - rule.shared) * value + rule.shared * around;
     });
+    const total = Math.max(links.reduce((sum, [, weight]) => sum + weight, 0), 1e-9);
+    return links.map(([m, weight]): Link => [m, weight / total]);
+  });
+}
+
+/** The part: from the border on, and what random walks add to it where that shortens its border. */
+function grown(smooth: Float64Array, base: number, border: number, links: Link[][], rule: PartRule): boolean[] {
+  const isBetween = (n: number): boolean => smooth[n] < border && smooth[n] > base;
+  const between = Array.from(smooth.keys()).filter(isBetween);
+  const reached = smooth.map((score, n) => (score >= border ? 1 : isBetween(n) ? (score - base) / Math.max(border - base, 1e-9) / 2 : 0));
+  for (let step = 0; step < rule.walked; step++) {
+    const next = between.map((n) => around(links[n], reached));
+    between.forEach((n, place) => (reached[n] = next[place]));
   }
-  return smooth;
+  const order = Array.from(reached.keys()).sort((a, b) => reached[b] - reached[a] || a - b);
+  const rank = new Float64Array(order.length);
+  order.forEach((n, place) => (rank[n] = place));
+  // A link crosses the border of those of the first splats that have one of its ends.
+  const change = new Float64Array(order.length + 1);
+  links.forEach((own, n) => {
+    for (const [m, weight] of own) {
+      if (rank[m] >= rank[n]) continue;
+      change[rank[m]] += weight;
+      change[rank[n]] -= weight;
+    }
+  });
+  const isPart = Array.from(smooth, (score) => score >= border);
+  const count = isPart.filter(Boolean).length;
+  let [size, fewest, crossing] = [0, Infinity, 0];
+  order.forEach((n, place) => {
+    crossing += change[place];
+    if (place + 1 >= count && reached[n] >= rule.nearest && crossing < fewest) [size, fewest] = [place + 1, crossing];
+  });
+  return isPart.map((is, n) => is || rank[n] < size);
 }
 
 /** The neighbors of each splat: the nearest ones, and those that it is one of the nearest of. */
@@ -92,8 +127,8 @@ function linked(thing: number[], centers: Float32Array, neighbors: number): Set<
   return links;
 }
 
-/** The lowest score of the part, and its best one. */
-function cut(scores: Float64Array, weights: Float64Array, rule: PartRule): { border: number; best: number; lowest: number } {
+/** The score of what is no part, the lowest one of the part, its best one, and the lowest of the thing. */
+function cut(scores: Float64Array, weights: Float64Array, rule: PartRule): { base: number; border: number; best: number; lowest: number } {
   const order = Array.from(scores.keys()).sort((a, b) => scores[a] - scores[b] || a - b);
   const ranked = order.map((n) => scores[n]);
   let sum = 0;
@@ -115,7 +150,7 @@ function cut(scores: Float64Array, weights: Float64Array, rule: PartRule): { bor
     const cost = Math.log(near + rule.few) + (place - rule.usual) ** 2 / (2 * rule.spread ** 2);
     if (cost < found.cost) found = { cost, border: limit };
   }
-  return { border: Math.max(found.border, 1e-6), best, lowest };
+  return { base, border: Math.max(found.border, 1e-6), best, lowest };
 }
 
 /** The first place of sorted values that is at least a value; their number if there is none. */

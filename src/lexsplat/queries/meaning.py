@@ -1,4 +1,4 @@
-"""Other words for the same thing, where a scene does not surely hold it by its first words: plurals and compound words.
+"""Other words for the same thing, where a scene is not sure of it by its first words: plurals and compound words.
 
 Encoders learn words as people write them. One may know "leaves" and not "leaf", "lamp shade" and not "lampshade".
 """

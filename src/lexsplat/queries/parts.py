@@ -9,6 +9,9 @@ that show a part show its surroundings. So segments do not say where a part ends
 3. The part reaches from the best score down to the border: the score that few Gaussians have, near `USUAL` of the way
    from the thing's median to its best score. If the part is most of the thing, as the shade is of a lamp, its lowest
    scores take the place of the median.
+4. The best scores alone may be the middle of a handle. Random walks along the links (Grady 2006) tell how near what
+   scores less is to the part. The part grows in this order to where the fewest links cross its border: where a handle
+   meets its mug.
 
 The constants were chosen on the second bundled scene and on the scene ``parts`` of tools/demo_scene
 (docs/lab-notes/2026-11-objects.md). Dimension letters: N Gaussians, M of the thing.
@@ -47,6 +50,11 @@ PLACES = np.linspace(0.5, 0.95, 46)
 """Places of the border that are tried, between what the thing scores and the best score."""
 NEAR, FEW = 0.05, 0.1
 """Reach of what counts as near a border, on the same scale, and the share of the part that is few in any case."""
+WALKED, NEAREST = 50, 0.2
+"""Steps of the random walks, and the least share of them that end in the part where it may grow."""
+FIRM = 0.5
+"""Scores in a part start at this share of the way from the border to 1. Pixels blend them with those beside it: with
+scores at the border, a pixel would have to show the part alone."""
 OUTSIDE = 0.5
 """Factor on scores outside the thing."""
 
@@ -95,18 +103,22 @@ def part_scores(relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: 
     weights = masses.cpu()[places].double().numpy()
     means = gaussians.means.detach().cpu()[places].double().numpy()
     colors = (0.5 + SH_C0 * gaussians.sh0.detach()[:, 0].cpu()[places]).clamp(0, 1).double().numpy()
-    smooth = _smoothed(own[places], means, colors, weights)
+    links = _links(own[places], means, colors, weights)
+    smooth = own[places]
+    for _ in range(ROUNDS):
+        smooth = (1 - SHARED) * own[places] + SHARED * (links @ smooth)
     if _quantile(smooth, weights, LOWEST) >= ALL:
         return None
-    border, best = _border(smooth, weights)
+    base, border, best = _border(smooth, weights)
+    part = _grown(smooth, base, border, links)
     scores = OUTSIDE * np.minimum(own / border, 1)
-    inside = np.clip((smooth - border) / max(best - border, 1e-6), 0, 1)
-    scores[places] = np.where(smooth >= border, 1 + inside, np.minimum(smooth / border, 1 - 1e-4))
+    inside = FIRM + (1 - FIRM) * np.clip((smooth - border) / max(best - border, 1e-6), 0, 1)
+    scores[places] = np.where(part, 1 + inside, np.minimum(smooth / border, 1 - 1e-4))
     return torch.from_numpy(SEGMENT_THRESHOLD * scores).to(relevancy)
 
 
-def _smoothed(values: FloatArray, means: FloatArray, colors: FloatArray, weights: FloatArray) -> FloatArray:
-    """Values ``[M]`` averaged with those of neighbors of a like color."""
+def _links(values: FloatArray, means: FloatArray, colors: FloatArray, weights: FloatArray) -> csr_array:
+    """Links ``[M, M]`` to neighbors, by how alike their colors and ``values`` are; they add up to 1 for each."""
     count, neighbors = len(values), min(NEIGHBORS + 1, len(values))
     found = cKDTree(means).query(means, k=neighbors, workers=torch.get_num_threads())[1][:, 1:]
     features = np.column_stack([colors / COLOR, values / SCORE])
@@ -116,11 +128,30 @@ def _smoothed(values: FloatArray, means: FloatArray, colors: FloatArray, weights
     weighted = np.exp(-np.einsum("mkc,mkc->mk", apart, apart)).ravel()
     links = csr_array((weighted, found.ravel(), starts), shape=(count, count))
     links = links.maximum(links.T)
-    totals = np.maximum(links @ weights, 1e-9)
-    smooth = values
-    for _ in range(ROUNDS):
-        smooth = (1 - SHARED) * values + SHARED * (links @ (weights * smooth)) / totals
-    return np.asarray(smooth)
+    links.data *= weights[links.indices]
+    links.data /= np.repeat(np.maximum(links.sum(1), 1e-9), np.diff(links.indptr))
+    return links
+
+
+def _grown(smooth: FloatArray, base: float, border: float, links: csr_array) -> NDArray[np.bool_]:
+    """The part ``[M]``: from the border on, and what random walks add to it where that shortens its border."""
+    part = smooth >= border
+    between = np.flatnonzero(~part & (smooth > base))
+    reached = part.astype(float)
+    reached[between] = (smooth[between] - base) / max(border - base, 1e-9) / 2
+    walk = links[between]
+    for _ in range(WALKED):
+        reached[between] = walk @ reached
+    order = np.argsort(-reached, kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    # A link crosses the border of those of the first Gaussians that have one of its ends.
+    first, last = rank[links.indices], np.repeat(rank, np.diff(links.indptr))
+    crosses, count = first < last, len(order) + 1
+    starts, ends = (np.bincount(end[crosses], links.data[crosses], count) for end in (first, last))
+    crossing = np.cumsum(starts - ends)  # [n]: of the first n + 1
+    fewest, most = int(part.sum()), int((reached >= NEAREST).sum())
+    return part | (rank < fewest + crossing[fewest - 1 : most].argmin()) if fewest else part
 
 
 def _quantile(scores: FloatArray, weights: FloatArray, share: float) -> float:
@@ -129,8 +160,8 @@ def _quantile(scores: FloatArray, weights: FloatArray, share: float) -> float:
     return float(scores[order[min(np.searchsorted(reached, share * reached[-1]), len(order) - 1)]])
 
 
-def _border(scores: FloatArray, weights: FloatArray) -> tuple[float, float]:
-    """The lowest score of the part, and its best one, from the scores ``[M]`` of the thing."""
+def _border(scores: FloatArray, weights: FloatArray) -> tuple[float, float, float]:
+    """What is no part, the lowest score of a part, and its best one, from the scores ``[M]`` of the thing."""
     order = np.argsort(scores, kind="stable")
     ranked, reached = scores[order], np.concatenate([[0.0], np.cumsum(weights[order])])
     best = float(ranked[-BEST:].mean())
@@ -144,4 +175,4 @@ def _border(scores: FloatArray, weights: FloatArray) -> tuple[float, float]:
     limits, reach = base + PLACES * (best - base), NEAR * (best - base)
     near = (above(limits - reach) - above(limits + reach)) / np.maximum(above(limits), 1e-9)
     unusual = (PLACES - USUAL) ** 2 / (2 * SPREAD**2)
-    return max(float(limits[(np.log(near + FEW) + unusual).argmin()]), 1e-6), best
+    return base, max(float(limits[(np.log(near + FEW) + unusual).argmin()]), 1e-6), best
