@@ -57,10 +57,8 @@ def chromium() -> Iterator:
         browser.close()
 
 
-def open_page(
-    browser, address: str, width: int = 480, height: int = 360, script: str = "", phone: bool = False
-):
-    """A page that has started or failed; ``page.requested`` and ``page.complaints`` are filled."""
+def blank_page(browser, width: int = 480, height: int = 360, script: str = "", phone: bool = False):
+    """An empty page for `show`; ``page.requested`` and ``page.complaints`` are filled."""
     size = {"width": width, "height": height}
     page = browser.new_page(
         viewport=size, reduced_motion="reduce", color_scheme="dark", has_touch=phone, is_mobile=phone
@@ -73,6 +71,25 @@ def open_page(
     page.on("pageerror", lambda error: page.complaints.append(str(error)))
     if script:
         page.add_init_script(script)
+    return page
+
+
+def show(page, address: str, width: int = 480, height: int = 360):
+    """Load an address in a page, faster than in a new one; returns the page when it has started or failed."""
+    page.goto("about:blank")  # another place in the same page would load nothing
+    page.requested.clear()
+    page.complaints.clear()
+    page.set_viewport_size({"width": width, "height": height})
+    page.goto(address)
+    until(page, "Boolean(window.lexsplat?.app || document.querySelector('.failure'))")
+    return page
+
+
+def open_page(
+    browser, address: str, width: int = 480, height: int = 360, script: str = "", phone: bool = False
+):
+    """A new page that has started or failed; see `blank_page`."""
+    page = blank_page(browser, width, height, script, phone)
     page.goto(address)
     until(page, "Boolean(window.lexsplat?.app || document.querySelector('.failure'))")
     return page

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from plyfile import PlyData
-from support.page_browser import CHROMIUM, ask, covered_tools, open_page, until
+from support.page_browser import CHROMIUM, ask, covered_tools, show, until
 from support.viewer_scene import WORDS, ball_scene
 
 from lexsplat.viewer.history import MAX_LENGTH, History
@@ -35,10 +35,10 @@ def viewer(monkeypatch) -> Iterator[ViewerServer]:
 
 
 @pytest.fixture
-def page(browser, viewer) -> Iterator[Any]:
-    opened = open_page(browser, f"{viewer.url}/#view=view0", 720, 480)  # wider than a phone
-    yield opened
-    opened.close()
+def page(tab, viewer) -> Iterator[Any]:
+    show(tab, f"{viewer.url}/#view=view0", 720, 480)  # wider than a phone
+    yield tab
+    tab.goto("about:blank")  # nothing is asked of the server once it has stopped
 
 
 def test_a_prompt_is_answered_by_the_server_with_its_scores_and_places(page, viewer):
@@ -302,9 +302,9 @@ def test_every_tool_can_be_pressed_on_small_windows(page):
         assert covered_tools(page) == [], (width, height)
 
 
-def test_a_link_with_a_phrase_that_is_refused_shows_the_scene_and_says_why(browser, viewer):
-    opened = open_page(browser, f"{viewer.url}/#q=%22&view=view0", 720, 480)
-    assert "quotation marks in pairs" in opened.locator(".status").inner_text()
-    ask(opened, "ball 1")
-    assert "here, one place" in opened.locator(".card").inner_text()
-    opened.close()
+def test_a_link_with_a_phrase_that_is_refused_shows_the_scene_and_says_why(tab, viewer):
+    show(tab, f"{viewer.url}/#q=%22&view=view0", 720, 480)
+    assert "quotation marks in pairs" in tab.locator(".status").inner_text()
+    ask(tab, "ball 1")
+    assert "here, one place" in tab.locator(".card").inner_text()
+    tab.goto("about:blank")
