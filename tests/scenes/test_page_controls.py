@@ -35,9 +35,21 @@ def address(tmp_path_factory) -> Iterator[str]:
         yield found
 
 
+@pytest.fixture(scope="module")
+def opened(browser, address) -> Iterator[Any]:
+    page = open_page(browser, address, 720, 480)
+    yield page
+    page.close()
+
+
 @pytest.fixture
-def page(tab, address) -> Any:
-    return show(tab, address, 720, 480)
+def page(opened) -> Any:
+    """A page without answers and open lists."""
+    opened.evaluate("lexsplat.app.clear()")
+    opened.locator(".search input").fill("")
+    for tool in opened.locator(".tools > button[aria-pressed=true]").all():
+        tool.click()
+    return opened
 
 
 def test_on_a_phone_the_keyboard_and_the_panels_go_away_after_a_choice(browser, address):
