@@ -147,6 +147,16 @@ def browser():
         yield running
 
 
+@pytest.fixture(scope="module")
+def tab(browser):
+    """A page for `page_browser.show`, one after another: it starts faster than new ones."""
+    from support.page_browser import blank_page
+
+    page = blank_page(browser)
+    yield page
+    page.close()
+
+
 @pytest.fixture
 def pretended_gpu(monkeypatch):
     """A pretended GPU with gsplat's kernels (`pretended_gpu`, `gsplat_kernels`); counts synchronizations."""

@@ -1,13 +1,11 @@
 """The report is readable in a real browser, wide and narrow."""
 
-import shutil
-
 import pytest
+from support.page_browser import CHROMIUM
 from support.report_pages import evaluated
 
 from lexsplat.evaluation.report import MeasuredMethod, write_comparison, write_report
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 VERSIONS = {f"package{number}": f"{number}.0.0+local.build" for number in range(12)}
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
@@ -30,18 +28,15 @@ def reports(tmp_path_factory):
 
 
 @pytest.fixture(scope="module", params=[1280, 400])
-def opened(request, reports):
+def opened(request, browser, reports):
     """The report in a window of some width; failed requests and console messages are in ``refused``."""
-    playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": request.param, "height": 800})
-        page.refused = []
-        page.on("console", lambda message: page.refused.append(message.text))
-        page.on("requestfailed", lambda request: page.refused.append(request.url))
-        page.goto((reports / "report.html").as_uri())
-        yield page
-        browser.close()
+    page = browser.new_page(viewport={"width": request.param, "height": 800})
+    page.refused = []
+    page.on("console", lambda message: page.refused.append(message.text))
+    page.on("requestfailed", lambda request: page.refused.append(request.url))
+    page.goto((reports / "report.html").as_uri())
+    yield page
+    page.close()
 
 
 def test_the_page_is_no_wider_than_its_window_and_requests_nothing(opened):

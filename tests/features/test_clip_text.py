@@ -36,6 +36,27 @@ def assert_same_embeddings(folder) -> None:
     assert light.content_hash == whole.content_hash
 
 
+def test_prompts_encoded_together_have_the_embeddings_of_each():
+    tower = load_text("bundled")
+    texts = [
+        *TEXTS,
+        *(f"{color} {thing}" for color in ("red", "pale yellow") for thing in ("cup", "box")),
+        *TEXTS,
+    ]
+    torch.testing.assert_close(tower.encode_together(texts), tower.encode_text(texts), atol=1e-6, rtol=0)
+
+
+@pytest.mark.slow
+def test_the_light_tower_is_exported_as_the_whole_model_is():
+    light, whole = (load("bundled").text_tower() for load in (load_text, load_clip))
+    assert light.tensors.keys() == whole.tensors.keys()
+    assert all(torch.equal(light.tensors[name], tensor) for name, tensor in whole.tensors.items())
+    for name in ("heads", "activation", "epsilon", "padding"):
+        assert getattr(light, name) == getattr(whole, name)
+    cut = {"truncation": None, "padding": None}  # the page cuts and pads by itself
+    assert light.tokenizer == {**whole.tokenizer, **cut}
+
+
 def changed_config(folder, target, **text):
     copy = shutil.copytree(folder, target)
     config = json.loads((copy / "config.json").read_text())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from typing import TYPE_CHECKING
 
 import pytest
@@ -32,6 +34,19 @@ def published_demo(made_once) -> Path:
         "published_demo",
         lambda target: publish(open_scene("demo"), target, PublishOptions(title="A table top")),
     )
+
+
+@pytest.fixture(scope="session")
+def light_demo(published_demo, made_once) -> Path:
+    """The published bundled scene; its page draws few of the Gaussians, as software does so slowly; read-only."""
+
+    def make(target: Path) -> None:
+        shutil.copytree(published_demo, target)
+        manifest = json.loads((target / "manifest.json").read_text())
+        manifest["scene"]["budget"] = 2_000
+        (target / "manifest.json").write_text(json.dumps(manifest))
+
+    return made_once("light_demo", make)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from support.page_browser import CHROMIUM, ask, covered_tools, open_page, serving, until
+from support.page_browser import CHROMIUM, ask, covered_tools, open_page, serving, show, until
 from support.viewer_scene import ball_scene
 
 from lexsplat.scenes.publishing import PublishOptions, publish, vocabulary
@@ -35,11 +35,21 @@ def address(tmp_path_factory) -> Iterator[str]:
         yield found
 
 
+@pytest.fixture(scope="module")
+def opened(browser, address) -> Iterator[Any]:
+    page = open_page(browser, address, 720, 480)
+    yield page
+    page.close()
+
+
 @pytest.fixture
-def page(browser, address) -> Iterator[Any]:
-    opened = open_page(browser, address, 720, 480)
-    yield opened
-    opened.close()
+def page(opened) -> Any:
+    """A page without answers and open lists."""
+    opened.evaluate("lexsplat.app.clear()")
+    opened.locator(".search input").fill("")
+    for tool in opened.locator(".tools > button[aria-pressed=true]").all():
+        tool.click()
+    return opened
 
 
 def test_on_a_phone_the_keyboard_and_the_panels_go_away_after_a_choice(browser, address):
@@ -138,8 +148,8 @@ def test_of_two_quick_questions_the_later_one_stays_whichever_is_answered_first(
         assert page.evaluate(slow, late) == [["ball 2"], ["ball 2", "ball 3", "ball 4"], 3]
 
 
-def test_every_tool_can_be_pressed_on_small_windows_also_with_answers(browser, address):
-    page = open_page(browser, address, 390, 844)
+def test_every_tool_can_be_pressed_on_small_windows_also_with_answers(tab, address):
+    page = show(tab, address, 390, 844)
     ask(page, "ball 1, ball 2, ball 3")
     until(page, "document.querySelectorAll('.card').length === 3")
     for width, height in SMALL:
@@ -148,23 +158,20 @@ def test_every_tool_can_be_pressed_on_small_windows_also_with_answers(browser, a
         assert covered_tools(page) == [], (width, height)
         title = page.locator(".title").bounding_box()
         assert title["height"] < 0.3 * height, "a long title leaves the picture free"
-    page.close()
 
 
-def test_links_that_ask_for_heat_press_its_tool_and_far_cameras_still_see_the_scene(browser, address):
-    page = open_page(browser, f"{address}#q=ball+2&show=heat", 720, 480)
+def test_links_that_ask_for_heat_press_its_tool_and_far_cameras_still_see_the_scene(tab, address):
+    page = show(tab, f"{address}#q=ball+2&show=heat", 720, 480)
     heat = page.locator(".tools").get_by_label("Show heat instead of marks")
     assert heat.get_attribute("aria-pressed") == "true"
     heat.click()
     assert heat.get_attribute("aria-pressed") == "false"
-    page.close()
     for camera in ("1e300,1e300,1e300,0,0,0,50", "1e300,0,0,1e300,0,0,50", "0,0,0,0,0,0,0"):
-        page = open_page(browser, f"{address}#camera={camera}", 720, 480)
+        show(page, f"{address}#camera={camera}", 720, 480)
         ask(page, "ball 2")
         reach = "lexsplat.app.stage.camera.position.length() / lexsplat.app.geometry.bounds().radius"
         assert page.evaluate(reach) < 100
         assert page.evaluate("lexsplat.app.answers[0].presence") == "yes"
-        page.close()
 
 
 def test_a_page_that_draws_nothing_answers_all_the_same(browser, address):

@@ -10,7 +10,7 @@ import pytest
 import torch
 from support.encoder_folders import write_clip
 from support.language_scene import CENTERS
-from support.page_browser import CHROMIUM, ask, open_page, picture, serving, until
+from support.page_browser import CHROMIUM, ask, open_page, picture, serving, show, until
 from support.siglip_folder import siglip_folder
 from support.viewer_scene import ball_scene
 
@@ -41,21 +41,18 @@ def ball_page(tmp_path, monkeypatch):
     return write
 
 
-def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_reported_without_a_text_tower(
-    browser, ball_page
-):
+def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_reported_without_a_text_tower(tab, ball_page):
     with serving(ball_page()) as address:
-        page = open_page(browser, address)
+        page = show(tab, address)
         assert page.evaluate("lexsplat.app.source.dictionary.similar('bal 3')[0]") == "ball 3"
         page.fill(".search input", "a green unicorn")
         page.keyboard.press("Enter")
         until(page, "document.querySelector('.status')?.textContent.includes('is not among')")
         assert page.locator(".card").count() == 0
-        page.close()
 
 
 @pytest.mark.parametrize("ending", ["ply", "spz", "sog"])
-def test_every_kind_of_splat_file_keeps_the_order_of_the_codes(browser, ball_page, monkeypatch, ending):
+def test_every_kind_of_splat_file_keeps_the_order_of_the_codes(tab, ball_page, monkeypatch, ending):
     if ending != "ply":
         monkeypatch.setattr(splat_file, "SMALL_BYTES", 0)
     if ending == "sog":
@@ -67,22 +64,19 @@ def test_every_kind_of_splat_file_keeps_the_order_of_the_codes(browser, ball_pag
     folder = ball_page()
     assert (folder / f"scene.{ending}").exists()
     with serving(folder) as address:
-        page = open_page(browser, address)
+        page = show(tab, address)
         geometry = page.evaluate(
             "(({ centers, opacities }) => [[...centers], [...opacities]])(lexsplat.app.geometry)"
         )
         ask(page, "ball 3")
         assert "here, one place" in page.locator(".card").inner_text()
-        page.close()
     centers, opacities = np.array(geometry[0]).reshape(-1, 3), np.array(geometry[1])
     assert np.abs(centers - scene.gaussians.means.numpy()).max() < 2e-3
     assert np.abs(opacities - scene.gaussians.opacities.numpy()).max() < 0.01
 
 
 @pytest.mark.parametrize("family", ["clip", "siglip"])
-def test_the_text_tower_of_another_encoder_answers_in_the_page_as_in_python(
-    browser, ball_page, tmp_path, family
-):
+def test_the_text_tower_of_another_encoder_answers_in_the_page_as_in_python(tab, ball_page, tmp_path, family):
     model = tmp_path / family
     model.mkdir()
     if family == "siglip":
@@ -93,7 +87,7 @@ def test_the_text_tower_of_another_encoder_answers_in_the_page_as_in_python(
     ball_page.scene.clip = str(model)
     texts = ["A Car!", "the wooden table", "red mug, blue books and an apple on the table", "Ünknown 42"]
     with serving(ball_page(words_only=False)) as address:
-        page = open_page(browser, address)
+        page = show(tab, address)
         ask(page, "ball 3")
         needed = [url for url in page.requested if url.endswith(("text.safetensors", "tokenizer.json"))]
         assert not needed, "a phrase of the dictionary needs no text tower"
@@ -106,13 +100,12 @@ def test_the_text_tower_of_another_encoder_answers_in_the_page_as_in_python(
         )
         ask(page, "a green unicorn")
         assert page.locator(".card strong").inner_text() == "a green unicorn"
-        page.close()
     expected = load_clip(str(model)).encode_text(texts)
     cosines = torch.nn.functional.cosine_similarity(torch.tensor(found), expected, dim=1)
     assert float(cosines.min()) > 1 - 1e-3
 
 
-def test_a_large_text_tower_is_loaded_only_after_its_size_was_reported(browser, ball_page, tmp_path):
+def test_a_large_text_tower_is_loaded_only_after_its_size_was_reported(tab, ball_page, tmp_path):
     model = tmp_path / "siglip"
     model.mkdir()
     siglip_folder(model, width=32)
@@ -125,7 +118,7 @@ def test_a_large_text_tower_is_loaded_only_after_its_size_was_reported(browser, 
     manifest["files"][path.name] = checksums(content)
     (folder / "manifest.json").write_text(json.dumps(manifest))
     with serving(folder) as address:
-        page = open_page(browser, address)
+        page = show(tab, address)
         page.fill(".search input", "a green unicorn")
         page.keyboard.press("Enter")
         button = page.get_by_role("button", name="Load the text model (12 MB) to ask anything")
@@ -134,12 +127,11 @@ def test_a_large_text_tower_is_loaded_only_after_its_size_was_reported(browser, 
         button.click()
         until(page, "Boolean(document.querySelector('.card'))")
         assert [url for url in page.requested if url.endswith(path.name)]
-        page.close()
 
 
-def test_a_click_names_the_thing(browser, ball_page):
+def test_a_click_names_the_thing(tab, ball_page):
     with serving(ball_page()) as address:
-        page = open_page(browser, address + "#view=view0")
+        page = show(tab, address + "#view=view0")
         centers = list(CENTERS)
         pixels = page.evaluate(
             """(points) => points.map((point) => {
@@ -153,13 +145,12 @@ def test_a_click_names_the_thing(browser, ball_page):
         nearest = int(np.argmin([np.linalg.norm(center - camera.position) for center in centers]))
         page.evaluate("(at) => lexsplat.app.whatIs(at[0], at[1]).then(() => null)", pixels[nearest])
         assert page.locator(".status .examples button").first.inner_text() == f"ball {nearest}"
-        page.close()
 
 
-def test_two_clicks_measure_the_distance_between_the_surfaces_there(browser, ball_page):
+def test_two_clicks_measure_the_distance_between_the_surfaces_there(tab, ball_page):
     scene = ball_page.scene
     with serving(ball_page()) as address:
-        page = open_page(browser, address + "#view=view0", 720, 480)
+        page = show(tab, address + "#view=view0", 720, 480)
         lens = page.evaluate("lexsplat.app.stage.lens()")
         width, height, focal, x, y = lens["lens"]
         K = np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
@@ -181,10 +172,9 @@ def test_two_clicks_measure_the_distance_between_the_surfaces_there(browser, bal
         label = page.locator(".distance").bounding_box()
         assert label["y"] + label["height"] <= min(mark["y"] for mark in marks), "the text hides no point"
         assert float(told.split()[0]) == pytest.approx(np.linalg.norm(first - second), rel=0.03)
-        page.close()
 
 
-def test_names_titles_and_prompts_of_others_run_no_script(browser, ball_page, tmp_path, monkeypatch):
+def test_names_titles_and_prompts_of_others_run_no_script(tab, ball_page, tmp_path, monkeypatch):
     scene = ball_page.scene
     scene.views = {HOSTILE if name == "view0" else name: view for name, view in scene.views.items()}
     words = vocabulary.everyday_phrases(False)
@@ -195,7 +185,7 @@ def test_names_titles_and_prompts_of_others_run_no_script(browser, ball_page, tm
         ball_page(target, title=HOSTILE, description=HOSTILE, start_view=HOSTILE, single_file=single)
     with serving(tmp_path / "hostile") as address:
         for place in (address, f"{address}#q={HOSTILE}&view={HOSTILE}", (tmp_path / "hostile.html").as_uri()):
-            page = open_page(browser, place)
+            page = show(tab, place)
             page.keyboard.press("v")
             page.fill(".search input", "<img")
             until(page, "document.querySelectorAll('#completions li').length > 0")
@@ -204,19 +194,16 @@ def test_names_titles_and_prompts_of_others_run_no_script(browser, ball_page, tm
             assert page.title() == " ".join(HOSTILE.split())
             assert page.locator("h1").inner_text() == " ".join(HOSTILE.split())
             assert page.locator("main img").count() == 0
-            page.close()
 
 
-def test_a_single_file_opens_by_double_click_and_a_folder_says_what_to_do(browser, ball_page, tmp_path):
+def test_a_single_file_opens_by_double_click_and_a_folder_says_what_to_do(tab, ball_page, tmp_path):
     single = ball_page(tmp_path / "balls.html", single_file=True)
-    page = open_page(browser, single.as_uri())
+    page = show(tab, single.as_uri())
     ask(page, "ball 3")
     assert "here" in page.locator(".card").inner_text()
     assert not [url for url in page.requested if not url.startswith(("file:", "blob:", "data:"))]
-    page.close()
-    page = open_page(browser, (ball_page() / "index.html").as_uri())
+    page = show(tab, (ball_page() / "index.html").as_uri())
     assert "python -m http.server" in page.locator(".failure").inner_text()
-    page.close()
 
 
 def test_the_picture_comes_before_the_words_and_what_is_typed_meanwhile_is_answered(browser, ball_page):
@@ -248,13 +235,13 @@ def test_the_picture_comes_before_the_words_and_what_is_typed_meanwhile_is_answe
 
 
 def test_of_too_many_gaussians_those_that_cover_most_from_the_camera_are_drawn_and_it_is_reported(
-    browser, ball_page, monkeypatch
+    tab, ball_page, monkeypatch
 ):
     """The importance of each is worked out here from the scene: opacity times area over squared depth."""
     monkeypatch.setattr("lexsplat.scenes.publishing.writing.DRAWN_SPLATS", 400)
     gaussians = ball_page.scene.gaussians
     with serving(ball_page()) as address:
-        page = open_page(browser, address + "#view=view0", 720, 480)
+        page = show(tab, address + "#view=view0", 720, 480)
         told = page.locator(".title").inner_text()
         assert "The page leaves out 1,100 of 1,500: those that cover least of the picture from here." in told
         assert "leaves out 1,100" in page.locator("dialog p.fine").first.text_content()
@@ -284,7 +271,6 @@ def test_of_too_many_gaussians_those_that_cover_most_from_the_camera_are_drawn_a
         assert (drawn["view0"] != drawn["view3"]).sum() > 50
         ask(page, "ball 3")
         assert "here, one place" in page.locator(".card").inner_text(), "answers know all Gaussians"
-        page.close()
 
 
 COUNTING = """
@@ -322,7 +308,9 @@ def test_software_draws_coarsely_at_first_and_a_prompt_computes_and_sorts_no_spl
         page.close()
 
 
-def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(browser, ball_page, tmp_path):
+def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(
+    browser, tab, ball_page, tmp_path
+):
     folder = ball_page()
     damaged = tmp_path / "damaged"
     shutil.copytree(folder, damaged)
@@ -330,15 +318,13 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(bro
     content[100] ^= 1
     (damaged / "codes.bin").write_bytes(content)
     with serving(damaged) as address:
-        page = open_page(browser, address)
+        page = show(tab, address)
         until(page, "Boolean(document.querySelector('.failure'))")
         assert page.locator(".failure").inner_text().startswith("codes.bin: expected the")
-        page.close()
     (damaged / "page.wasm").write_bytes(b"damaged")
     with serving(damaged) as address:
-        page = open_page(browser, address)
+        page = show(tab, address)
         assert page.locator(".failure").inner_text().startswith("page.wasm: expected WebAssembly")
-        page.close()
     with serving(folder) as address:
         page = open_page(browser, address, script="HTMLCanvasElement.prototype.getContext = () => null")
         assert "needs WebGL 2" in page.locator(".failure").inner_text()
@@ -370,14 +356,13 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(bro
         (lambda m: m.clear(), "version 7 of a lexsplat page"),
     ],
 )
-def test_a_manifest_that_lacks_a_field_is_refused_by_its_name(browser, ball_page, change, told):
+def test_a_manifest_that_lacks_a_field_is_refused_by_its_name(tab, ball_page, change, told):
     folder = ball_page()
     manifest = json.loads((folder / "manifest.json").read_text())
     change(manifest)
     (folder / "manifest.json").write_text(json.dumps(manifest))
     with serving(folder) as address:
-        page = open_page(browser, address)
+        page = show(tab, address)
         line = page.locator(".failure").inner_text().strip()
-        page.close()
     assert line.startswith(f"manifest.json: expected {told}, found ")
     assert "\n" not in line

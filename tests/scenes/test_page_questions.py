@@ -66,8 +66,8 @@ def demo() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def page(browser, published_demo) -> Iterator[Any]:
-    with serving(published_demo) as address:
+def page(browser, light_demo) -> Iterator[Any]:
+    with serving(light_demo) as address:
         yield open_page(browser, address, 900, 600)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import binary_erosion
-from support.page_browser import CHROMIUM, ask, open_page, picture, serving, until
+from support.page_browser import CHROMIUM, ask, open_page, picture, serving, show, until
 
 from lexsplat.queries.vocabulary import COLORS, is_part_alone, thing_of_part
 from lexsplat.rendering import render
@@ -48,8 +48,8 @@ def demo() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def address(published_demo) -> Iterator[str]:
-    with serving(published_demo) as found:
+def address(light_demo) -> Iterator[str]:
+    with serving(light_demo) as found:
         yield found
 
 
@@ -58,6 +58,34 @@ def page(browser, address) -> Iterator[Any]:
     opened = open_page(browser, address)
     yield opened
     opened.close()
+
+
+VISIBILITY = (
+    "(how) => document.querySelectorAll('.bar, .tools, .title').forEach((e) => { e.style.visibility = how; })"
+)
+
+
+@pytest.fixture(scope="module")
+def pictured(browser, published_demo) -> Iterator[Any]:
+    """A page that draws all Gaussians, from where a photo was taken; nothing but the picture is seen."""
+    with serving(published_demo) as place:
+        opened = open_page(browser, place + "#view=view_010.jpg", *SIZE)
+        opened.evaluate(VISIBILITY, "hidden")
+        yield opened
+        opened.close()
+
+
+BASE64 = """(scores) => {
+    const bytes = new Uint8Array(scores.buffer);
+    let text = "";
+    for (let i = 0; i < bytes.length; i += 4096) text += String.fromCharCode(...bytes.subarray(i, i + 4096));
+    return btoa(text);
+}"""
+"""Numbers as text: a list of so many takes Playwright a third of a second."""
+
+
+def numbers(text: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), np.float32)
 
 
 def test_the_demo_with_its_text_tower_has_at_most_8_megabytes(published_demo):
@@ -73,26 +101,22 @@ def test_answers_are_those_of_python(page, demo):
             const answers = [];
             for (const prompt of prompts) {
                 const answer = await app.source.answer(prompt, "#fff");
-                const bytes = new Uint8Array(answer.scores.buffer);
-                let text = "";
-                for (let i = 0; i < bytes.length; i += 4096) {
-                    text += String.fromCharCode(...bytes.subarray(i, i + 4096));
-                }
+                const scores = (BASE64)(answer.scores);
                 await app.source.refine(answer);
                 const places = answer.places;
-                answers.push({ ...answer, scores: btoa(text), places: places.length,
+                answers.push({ ...answer, scores, places: places.length,
                     marked: places.reduce((sum, place) => sum + place.splats.length, 0),
                     embedding: [...tower.embed(prompt)] });
             }
             return answers;
-        }""",
+        }""".replace("BASE64", BASE64),
         PROMPTS,
     )
     phrases = [answer["phrase"] for answer in found]
     asked = demo.ask(phrases)
     embeddings = demo.embed(PROMPTS)
     for number, answer in enumerate(found):
-        scores = np.frombuffer(base64.b64decode(answer["scores"]), np.float32)
+        scores = numbers(answer["scores"])
         expected, near = asked.scores[number].numpy(), 0.02
         if thing_of_part(answer["phrase"]) or is_part_alone(answer["phrase"]):
             # Rounded centers have other neighbors, which move the shortest border; scores of parts are stretched.
@@ -138,16 +162,16 @@ def test_free_phrases_have_the_scores_and_segments_of_python(page, demo):
             const answers = [];
             for (const prompt of prompts) {
                 const { from, phrase, presence, scores } = await lexsplat.app.source.answer(prompt, "#fff");
-                answers.push({ from, phrase, presence, scores: [...scores] });
+                answers.push({ from, phrase, presence, scores: (BASE64)(scores) });
             }
             return answers;
-        }""",
+        }""".replace("BASE64", BASE64),
         prompts,
     )
     assert {answer["from"] for answer in found} == {"text tower"}
     asked = demo.ask([answer["phrase"] for answer in found])
     for number, answer in enumerate(found):
-        scores, expected = np.array(answer["scores"]), asked.scores[number].numpy()
+        scores, expected = numbers(answer["scores"]), asked.scores[number].numpy()
         assert answer["presence"] == asked.presences[number], answer["phrase"]
         assert np.array_equal(scores >= 0.5, expected >= 0.5), answer["phrase"]
         assert np.abs(scores - expected).max() <= 1 / 255, answer["phrase"]
@@ -199,10 +223,8 @@ def test_a_kind_is_answered_by_the_objects_that_python_finds(page, demo, prompt)
         assert instance.phrase in found["note"]
 
 
-def test_an_answer_is_marked_where_it_is_and_nothing_is_marked_for_what_is_absent(browser, address, demo):
-    page = open_page(browser, address + "#view=view_010.jpg", *SIZE)
-    bare = "document.querySelectorAll('.bar, .tools, .title').forEach((one) => { one.style.visibility = 'hidden'; })"
-    page.evaluate(bare)
+def test_an_answer_is_marked_where_it_is_and_nothing_is_marked_for_what_is_absent(pictured, demo):
+    page = pictured
     before = picture(page)
     page.evaluate("lexsplat.app.ask('red apple', false, false)")
     after = picture(page)
@@ -220,7 +242,6 @@ def test_an_answer_is_marked_where_it_is_and_nothing_is_marked_for_what_is_absen
     assert 10 * np.log10(255**2 / np.square(before - ours).mean()) > 33, "the picture is that of our renderer"
     page.evaluate("lexsplat.app.ask('zebra', false, false)")
     assert np.abs(picture(page) - before).mean() < 0.5
-    page.close()
 
 
 def test_the_page_asks_for_nothing_but_its_folder_and_its_policy_forbids_it(page, address):
@@ -233,7 +254,7 @@ def test_the_page_asks_for_nothing_but_its_folder_and_its_policy_forbids_it(page
     assert any("Content Security Policy" in text for text in page.complaints)
 
 
-def test_asking_speaks_shows_a_card_and_is_kept_in_the_link(page, browser, address):
+def test_asking_speaks_shows_a_card_and_is_kept_in_the_link(page, tab, address):
     ask(page, "red apple, zebra")
     cards = page.locator(".card")
     assert cards.count() == 2
@@ -242,11 +263,10 @@ def test_asking_speaks_shows_a_card_and_is_kept_in_the_link(page, browser, addre
     assert "red apple: here" in page.locator("[role=status]").inner_text()
     until(page, "location.hash.includes('q=red+apple') && location.hash.includes('q=zebra')")
     link = page.evaluate("location.href")
-    again = open_page(browser, link)
-    assert again.locator(".card strong").all_inner_texts() == ["red apple", "zebra"]
-    positions = [one.evaluate("lexsplat.app.stage.camera.position.toArray()") for one in (page, again)]
+    show(tab, link)
+    assert tab.locator(".card strong").all_inner_texts() == ["red apple", "zebra"]
+    positions = [one.evaluate("lexsplat.app.stage.camera.position.toArray()") for one in (page, tab)]
     assert np.allclose(*positions, atol=1e-3)
-    again.close()
 
 
 def test_of_several_prompts_the_camera_flies_to_the_first_that_is_here(page):
@@ -300,20 +320,18 @@ def test_the_best_guess_for_what_is_absent_marks_the_place_with_the_best_scores(
     page.keyboard.press("Escape")
 
 
-def test_in_heat_two_prompts_keep_their_colors_and_the_page_says_so(browser, address):
-    page = open_page(browser, address, *SIZE)
+def test_in_heat_two_prompts_keep_their_colors_and_the_page_says_so(pictured):
+    page = pictured
+    page.evaluate(VISIBILITY, "")
     page.evaluate("lexsplat.app.ask('red apple, banana', false, false)")
     page.keyboard.press("h")
     assert "each prompt in its own color" in page.locator(".status").inner_text()
-    page.evaluate(
-        "document.querySelectorAll('.bar, .tools').forEach((e) => { e.style.visibility = 'hidden'; })"
-    )
+    page.evaluate(VISIBILITY, "hidden")
     image = picture(page)
     orange = (image[..., 0] > image[..., 2] + 90).mean()  # the first color of Okabe and Ito
     blue = (image[..., 2] > image[..., 0] + 60).mean()  # the second
     assert orange > 5e-4
     assert blue > 5e-4
-    page.close()
 
 
 @pytest.mark.parametrize(
@@ -343,8 +361,8 @@ def test_words_that_nobody_knows_are_named_and_well_spelled_words_stay(page, dem
         assert page.evaluate(f"{spelling}.strange('{phrase}')") == [], phrase
 
 
-def test_on_a_phone_nothing_is_cut_off_and_the_answer_is_not_covered(browser, address):
-    page = open_page(browser, address, 390, 844)
+def test_on_a_phone_nothing_is_cut_off_and_the_answer_is_not_covered(tab, address):
+    page = show(tab, address, 390, 844)
     ask(page, "red apple")
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     boxes = {name: page.locator(name).first.bounding_box() for name in (".search", ".sheet", ".tools")}
@@ -356,7 +374,6 @@ def test_on_a_phone_nothing_is_cut_off_and_the_answer_is_not_covered(browser, ad
     spot = page.evaluate("(() => lexsplat.app.stage.pixel(lexsplat.app.answers[0].places[0].center))()")
     assert boxes[".search"]["y"] + boxes[".search"]["height"] < spot["y"] < boxes[".sheet"]["y"]
     assert 0 < spot["x"] < boxes[".tools"]["x"]
-    page.close()
 
 
 def test_nothing_is_drawn_while_nothing_changes(page):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 from collections.abc import Iterator
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from plyfile import PlyData
-from support.page_browser import CHROMIUM, ask, covered_tools, open_page, until
+from support.page_browser import CHROMIUM, ask, covered_tools, open_page, show, until
 from support.viewer_scene import WORDS, ball_scene
 
 from lexsplat.viewer.history import MAX_LENGTH, History
@@ -24,21 +25,39 @@ PIXELS = """(points) => points.map((point) => {
 })"""
 
 
-@pytest.fixture
-def viewer(monkeypatch) -> Iterator[ViewerServer]:
-    monkeypatch.setattr(History, "load", lambda *_: History(prompts=["ball 4"], vocabulary=[*WORDS, "spoon"]))
+@contextlib.contextmanager
+def serving_balls() -> Iterator[ViewerServer]:
     scene, ground_truth = ball_scene()
-    running = ViewerServer(scene, ViewerConfig(port=0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(History, "load", lambda *_: History(prompts=["ball 4"], vocabulary=[*WORDS, "spoon"]))
+        running = ViewerServer(scene, ViewerConfig(port=0))
     running.scene, running.ground_truth = scene, ground_truth
-    yield running
-    running.stop()
+    try:
+        yield running
+    finally:
+        running.stop()
 
 
 @pytest.fixture
-def page(browser, viewer) -> Iterator[Any]:
-    opened = open_page(browser, f"{viewer.url}/#view=view0", 720, 480)  # wider than a phone
-    yield opened
-    opened.close()
+def viewer() -> Iterator[ViewerServer]:
+    with serving_balls() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def shared_page(browser) -> Iterator[Any]:
+    """A page for tests that edit nothing."""
+    with serving_balls() as running:
+        opened = open_page(browser, f"{running.url}/#view=view0", 720, 480)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def page(tab, viewer) -> Iterator[Any]:
+    show(tab, f"{viewer.url}/#view=view0", 720, 480)  # wider than a phone
+    yield tab
+    tab.goto("about:blank")  # nothing is asked of the server once it has stopped
 
 
 def test_a_prompt_is_answered_by_the_server_with_its_scores_and_places(page, viewer):
@@ -59,7 +78,8 @@ def test_a_prompt_is_answered_by_the_server_with_its_scores_and_places(page, vie
     assert all(url.startswith((viewer.url, "blob:", "data:")) for url in page.requested)
 
 
-def test_a_card_reports_how_a_question_was_understood_and_what_was_not(page):
+def test_a_card_reports_how_a_question_was_understood_and_what_was_not(shared_page):
+    page = shared_page
     ask(page, "where can I find the ball 4 next to the ball 0?")
     assert page.locator(".card .understood").inner_text() == "as “ball 4 next to ball 0”"
     ask(page, "why is ball 2 so round")
@@ -69,7 +89,8 @@ def test_a_card_reports_how_a_question_was_understood_and_what_was_not(page):
     assert page.locator(".card .understood").count() == 0
 
 
-def test_an_error_of_the_server_is_reported_in_one_line(page):
+def test_an_error_of_the_server_is_reported_in_one_line(shared_page):
+    page = shared_page
     page.fill(".search input", 'ball "1')
     page.keyboard.press("Enter")
     until(page, "document.querySelector('.status')?.textContent.includes('quotation marks in pairs')")
@@ -194,13 +215,16 @@ def test_objects_are_listed_and_other_colors_shown(page, viewer):
     until(page, "document.querySelector('.status').textContent.includes('Colors: language')")
 
 
-def test_a_video_is_recorded(page, tmp_path):
-    kind, size = page.evaluate("lexsplat.app.stage.record(1).then((made) => [made.suffix, made.video.size])")
+def test_a_video_is_recorded(shared_page):
+    kind, size = shared_page.evaluate(
+        "lexsplat.app.stage.record(1).then((made) => [made.suffix, made.video.size])"
+    )
     assert kind in (".mp4", ".webm")
     assert size > 500
 
 
-def test_a_video_without_a_picture_is_reported_and_not_saved(page):
+def test_a_video_without_a_picture_is_reported_and_not_saved(shared_page):
+    page = shared_page
     told = page.evaluate(
         """async () => {
             const record = MediaRecorder.prototype.start;
@@ -215,7 +239,8 @@ def test_a_video_without_a_picture_is_reported_and_not_saved(page):
     assert told.startswith("The browser recorded no picture")
 
 
-def test_a_video_has_many_pictures_also_where_they_take_long(page):
+def test_a_video_has_many_pictures_also_where_they_take_long(shared_page):
+    page = shared_page
     drawn = page.evaluate(
         """async () => {
             const { stage } = lexsplat.app;
@@ -293,7 +318,8 @@ def test_a_hidden_answer_leaves_no_preview_in_the_picture_and_after_an_edit_the_
     until(page, "lexsplat.app.server.entry.version === 3")
 
 
-def test_every_tool_can_be_pressed_on_small_windows(page):
+def test_every_tool_can_be_pressed_on_small_windows(shared_page):
+    page = shared_page
     ask(page, "ball 1, ball 2, ball 3")
     until(page, "document.querySelectorAll('.card').length === 3")
     for width, height in ((667, 375), (740, 360), (800, 360), (390, 667), (360, 640), (390, 844), (720, 480)):
@@ -302,9 +328,9 @@ def test_every_tool_can_be_pressed_on_small_windows(page):
         assert covered_tools(page) == [], (width, height)
 
 
-def test_a_link_with_a_phrase_that_is_refused_shows_the_scene_and_says_why(browser, viewer):
-    opened = open_page(browser, f"{viewer.url}/#q=%22&view=view0", 720, 480)
-    assert "quotation marks in pairs" in opened.locator(".status").inner_text()
-    ask(opened, "ball 1")
-    assert "here, one place" in opened.locator(".card").inner_text()
-    opened.close()
+def test_a_link_with_a_phrase_that_is_refused_shows_the_scene_and_says_why(tab, viewer):
+    show(tab, f"{viewer.url}/#q=%22&view=view0", 720, 480)
+    assert "quotation marks in pairs" in tab.locator(".status").inner_text()
+    ask(tab, "ball 1")
+    assert "here, one place" in tab.locator(".card").inner_text()
+    tab.goto("about:blank")

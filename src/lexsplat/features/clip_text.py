@@ -6,6 +6,8 @@ It answers questions for every model of CLIP's original architecture, in the fil
 
 from __future__ import annotations
 
+import itertools
+import json
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lexsplat.features.hub import content_hash
+from lexsplat.features.portable import TextWeights
 from lexsplat.features.weights import load_weights, read_config
 
 log = logging.getLogger("lexsplat")
@@ -33,6 +36,8 @@ _DEFAULTS = {  # of transformers' CLIPTextConfig, which files may leave out
 _LEGACY_END = 2
 """An end token of this number stands for the largest number in the prompt, as in OpenAI's code."""
 _MOST_LAYERS = 1000
+_TOGETHER = 64
+"""Prompts in one pass of `ClipText.encode_together`, at most."""
 UNLIKE = 1e-5
 """Largest distance of two unit vectors that are equal up to rounding."""
 UNLIKE_WORDS = ("an apple", "a wooden table", "blue sky", "a car")
@@ -164,7 +169,8 @@ class ClipText:
         self._heads, self._layers = settings["num_attention_heads"], settings["num_hidden_layers"]
         self._epsilon, self._end = settings["layer_norm_eps"], settings["eos_token_id"]
         self._limit = settings["max_position_embeddings"]
-        self._activation = _ACTIVATIONS[settings["hidden_act"]]
+        self._activation_name = settings["hidden_act"]
+        self._activation = _ACTIVATIONS[self._activation_name]
         # Copies, because tensors in a file are not aligned, and alignment affects the rounding of sums.
         self._weights = {
             re.sub(r"^text_model\.", "", name): value.to(self.device, torch.float32, copy=True)
@@ -179,17 +185,56 @@ class ClipText:
     @torch.inference_mode()
     def _encode(self, prompt: str) -> Tensor:
         ids = self._tokens(prompt)
+        return self._projected(self._hidden(ids[None])[0, self._place_of_end(ids)])
+
+    @torch.inference_mode()
+    def encode_together(self, prompts: Sequence[str]) -> Tensor:
+        """`encode_text` of thousands of prompts, several times as fast and equal up to rounding.
+
+        Prompts with the same number of tokens share a pass, so that none is padded.
+        """
+        tokens = [self._tokens(prompt) for prompt in prompts]
+        order = sorted(range(len(tokens)), key=lambda number: len(tokens[number]))
+        found: list[Tensor] = [torch.empty(0)] * len(tokens)
+        for _, alike in itertools.groupby(order, key=lambda number: len(tokens[number])):
+            numbers = list(alike)
+            for start in range(0, len(numbers), _TOGETHER):
+                batch = numbers[start : start + _TOGETHER]
+                hidden = self._hidden(torch.stack([tokens[number] for number in batch]))
+                ends = [self._place_of_end(tokens[number]) for number in batch]
+                for number, row in zip(batch, self._projected(hidden[torch.arange(len(batch)), ends])):
+                    found[number] = row
+        return torch.stack(found)
+
+    def text_tower(self) -> TextWeights:
+        """The tower for other programs."""
+        return TextWeights(
+            {name: tensor.cpu() for name, tensor in self._weights.items()},
+            self._heads,
+            self._activation_name,
+            self._epsilon,
+            json.loads(self._tokenizer.to_str()),
+            None,
+        )
+
+    def _hidden(self, ids: Tensor) -> Tensor:
+        """The last layer's output ``[B, T, W]`` at tokens ``[B, T]``."""
         weights = self._weights
         x = weights["embeddings.token_embedding.weight"][ids]
-        x = (x + weights["embeddings.position_embedding.weight"][: len(ids)])[None]
+        x = x + weights["embeddings.position_embedding.weight"][: ids.shape[1]]
         for number in range(self._layers):
             layer = f"encoder.layers.{number}"
             x = x + self._attention(self._norm(x, f"{layer}.layer_norm1"), f"{layer}.self_attn")
             hidden = self._linear(self._norm(x, f"{layer}.layer_norm2"), f"{layer}.mlp.fc1")
             x = x + self._linear(self._activation(hidden), f"{layer}.mlp.fc2")
-        x = self._norm(x, "final_layer_norm")
-        end = ids if self._end == _LEGACY_END else (ids == self._end).int()
-        return F.normalize(x[0, int(end.argmax())] @ weights["text_projection.weight"].T, dim=-1).cpu()
+        return self._norm(x, "final_layer_norm")
+
+    def _projected(self, hidden: Tensor) -> Tensor:
+        return F.normalize(hidden @ self._weights["text_projection.weight"].T, dim=-1).cpu()
+
+    def _place_of_end(self, ids: Tensor) -> int:
+        """Place of the end token among the tokens ``[T]`` of a prompt."""
+        return int((ids if self._end == _LEGACY_END else (ids == self._end).int()).argmax())
 
     def tokens_over(self, prompt: str) -> int:
         """Number of tokens by which a prompt exceeds the positions of the model and is truncated."""

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lexsplat.features.clip import ClipEncoder
-from lexsplat.features.encoders import load_clip
+from lexsplat.features.portable import TextWeights
+from lexsplat.features.text import load_text
 from lexsplat.queries import everyday, part_names, presence
 from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES
 from lexsplat.runtime.files import save_tensors
@@ -34,8 +34,8 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
     Returns:
         The entry "text" of the manifest; None if the encoder is neither a CLIP nor a SigLIP.
     """
-    encoder = load_clip(scene.clip)
-    tower = encoder.text_tower() if isinstance(encoder, ClipEncoder) else None
+    encoder = load_text(scene.clip)
+    tower: TextWeights | None = getattr(encoder, "text_tower", lambda: None)()
     if tower is None:
         return None
     tensors = _quantized(tower.tensors)

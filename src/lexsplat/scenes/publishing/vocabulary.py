@@ -132,10 +132,12 @@ def phrase_answers(scene: Scene, phrases: list[str]) -> tuple[Tensor, list[str]]
     """
     scale, field = scene.everyday_scale, scene.field
     codewords = field.codebook.clip
+    encoder = scene.preload()
+    encode = getattr(encoder, "encode_together", encoder.encode_text)
+    embeddings = embed_prompts(phrases, encode, scene.query.templates)
     tables, presences = [], []
     for start in range(0, len(phrases), _BATCH):
-        batch = phrases[start : start + _BATCH]
-        texts = embed_prompts(batch, scene.preload().encode_text, scene.query.templates)
+        batch, texts = phrases[start : start + _BATCH], embeddings[start : start + _BATCH]
         best = scene.presence_classifier.best_heights(batch)
         relevancy = scale.relevancy(codewords, texts.to(codewords.device), best)
         tables.append((relevancy.T * 255).round().to(torch.uint8).cpu())
