@@ -1,8 +1,8 @@
 """Adam and AdamW that do not import torch's compiler, which nothing here uses.
 
-An optimizer of torch imports the compiler when it is made, and with it sympy: 800 modules, which take as long as torch
-itself. It does so to keep the compiler out of its methods. The classes below have the methods alone, whose results are
-the same bits.
+An optimizer of torch imports the compiler when it is made, and with it sympy: 800 modules, which take as long as
+torch itself. It does so to keep the compiler out of its methods. The classes below have the methods alone, whose
+results are the same bits.
 """
 
 from __future__ import annotations
