@@ -34,6 +34,7 @@ UP = np.array([0.0, 0.0, 1.0])
 @pytest.fixture(autouse=True)
 def _few_candidates(monkeypatch) -> None:
     """Choices of a test take seconds."""
+    monkeypatch.setattr(choosing, "SIZE", (240, 180))
     monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 30)
     monkeypatch.setattr(candidates, "_MOST_PLACES", 10)
 
