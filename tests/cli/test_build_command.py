@@ -11,6 +11,7 @@ from support.tiny_capture import QUICK_BUILD as QUICK
 
 from lexsplat import cli, open_scene
 from lexsplat.features import hub
+from lexsplat.scenes.publishing import vocabulary
 
 
 def test_build_writes_the_scene_folder_of_the_design(built):
@@ -44,8 +45,10 @@ def test_building_again_changes_no_result(built, tiny_capture):
 
 
 def test_the_commands_that_are_proposed_name_a_path_with_spaces_as_one_word(
-    built, tiny_capture, tmp_path, capsys
+    built, tiny_capture, tmp_path, capsys, monkeypatch
 ):
+    # The command that is proposed does not depend on the phrases; thousands of them take most of the time.
+    monkeypatch.setattr(vocabulary, "everyday_phrases", lambda bundled: {"apple": vocabulary.NAME})
     scene, page = str(tmp_path / "my scene"), str(tmp_path / "my page")
     shutil.copytree(built, scene)
     assert cli.main(["build", str(tiny_capture), "--output", scene, *QUICK]) == 0

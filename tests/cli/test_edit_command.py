@@ -188,6 +188,7 @@ def test_an_edit_with_an_invalid_result_ends_in_one_line_and_adds_no_step(built,
 def test_edits_of_the_bundled_scene_are_kept_in_the_working_directory(tmp_path, monkeypatch, capsys):
     before = {path: path.stat().st_mtime_ns for path in BUNDLED_SCENE.rglob("*")}
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lexsplat.scenes.editing.keep_for", lambda *_: None)  # no question is asked of it
     assert cli.main(["edit", "demo", "delete", "--select", "red apple"]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["demo_edits.jsonl"]
     less = capsys.readouterr().out.splitlines()[-1]

@@ -4,7 +4,6 @@ import asyncio
 import json
 import os
 import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,6 +11,7 @@ import pytest
 pytest.importorskip("mcp")
 from mcp import Client
 from mcp.client.stdio import StdioServerParameters
+from support.forked_commands import startable
 
 from lexsplat.cli import main
 
@@ -28,14 +28,15 @@ def transcript():
 
 @pytest.mark.slow
 def test_the_transcript_of_the_page_is_what_a_client_gets_over_standard_input_and_output():
-    async def replay():
-        command = ["-m", "lexsplat", "mcp", "demo"]
-        server = StdioServerParameters(command=sys.executable, args=command, env=dict(os.environ))
+    async def replay(command):
+        server = StdioServerParameters(command=command[0], args=command[1:], env=dict(os.environ))
         async with Client(server) as client:
             return [await client.call_tool(tool, given) for tool, given, _ in transcript()]
 
     assert len(transcript()) >= 7
-    for (tool, given, shown), reply in zip(transcript(), asyncio.run(replay())):
+    with startable("mcp", "demo") as command:
+        replies = asyncio.run(replay(command))
+    for (tool, given, shown), reply in zip(transcript(), replies, strict=True):
         said = reply.content[0].text
         assert NUMBER.sub("#", said) == NUMBER.sub("#", shown), (tool, given)
         figures = [float(number) for number in NUMBER.findall(said)]

@@ -47,6 +47,14 @@ def server(scenes) -> MCPServer:
     return make_server(scenes)
 
 
+@pytest.fixture(scope="module")
+def writing(scenes, tmp_path_factory):
+    """A server that writes, its folder, and its reply to an edit."""
+    folder = tmp_path_factory.mktemp("writing") / "output"
+    server = make_server(scenes, folder)
+    return server, folder, ask(server, "edit", action="delete", phrase="toy car", folder="demo")
+
+
 def place(thing):
     return thing["center"][:2]
 
@@ -247,9 +255,8 @@ def test_resources_and_prompts_are_offered(server):
 
 
 @pytest.mark.slow
-def test_the_result_of_an_edit_can_be_asked_at_once(scenes, tmp_path):
-    server = make_server(scenes, tmp_path)
-    reply, text = ask(server, "edit", action="delete", phrase="toy car", folder="demo")
+def test_the_result_of_an_edit_can_be_asked_at_once(scenes, writing):
+    server, _, (reply, text) = writing
     assert not reply.is_error
     assert (reply.structured_content["name"], "the scene demo-2 in" in text) == ("demo-2", True)
     assert (
@@ -264,11 +271,12 @@ def test_the_result_of_an_edit_can_be_asked_at_once(scenes, tmp_path):
 
 
 @pytest.mark.slow
-def test_tools_that_write_are_offered_on_demand_and_write_new_files_in_one_folder_alone(scenes, tmp_path):
-    server = make_server(scenes, tmp_path / "output")
+def test_tools_that_write_are_offered_on_demand_and_write_new_files_in_one_folder_alone(writing):
+    server, output, (reply, _) = writing
+    assert not reply.is_error
     reply, _ = ask(server, "export", phrase="rubber duck", file="duck.ply")
     assert not reply.is_error
-    assert (tmp_path / "output" / "duck.ply").stat().st_size > 1000
+    assert (output / "duck.ply").stat().st_size > 1000
     for name in (
         "../duck.ply",
         "/tmp/duck.ply",
@@ -281,10 +289,8 @@ def test_tools_that_write_are_offered_on_demand_and_write_new_files_in_one_folde
     ):
         reply, _ = ask(server, "export", phrase="rubber duck", file=name)
         assert reply.is_error, name
-    assert [path.name for path in tmp_path.rglob("*.ply")] == ["duck.ply"]
-    reply, _ = ask(server, "edit", action="delete", phrase="rubber duck", folder="without")
-    assert not reply.is_error
-    answers = open_scene(tmp_path / "output" / "without").ask(["rubber duck", "red apple"])
+    assert set(output.parent.rglob("*.ply")) == {output / "duck.ply", output / "demo" / "gaussians.ply"}
+    answers = open_scene(output / "demo").ask(["toy car", "red apple"])
     assert [answer["present"] for answer in answers.to_dict()["answers"]] == ["no", "yes"]
 
 

@@ -3,12 +3,14 @@
 import json
 import os
 import runpy
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from support.forked_commands import startable
 from support.tiny_capture import write_capture
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -80,10 +82,16 @@ def test_07_reports_which_scenes_hold_a_thing(run, tmp_path):
     assert (tmp_path / "output" / "examples" / "found" / "demo" / "red_apple.jpg").stat().st_size > 1000
 
 
-def test_08_asks_from_a_shell():
-    environment = {**os.environ, "LEXSPLAT": f"{sys.executable} -m lexsplat", "PYTHON": sys.executable}
+def test_08_asks_from_a_shell(tmp_path):
+    environment = {**os.environ, "LEXSPLAT": f"sh {tmp_path}/lexsplat", "PYTHON": f"{sys.executable} -I -S"}
     arguments = ["sh", EXAMPLES / "08_shell.sh", "demo", "apple", "unicorn", 'the "mug', 'a "mug"', "\\"]
-    done = subprocess.run(arguments, capture_output=True, text=True, env=environment, timeout=300)
+    with startable("info", "demo") as info, startable("ask", "demo", "--stdin") as ask:
+        lines = (
+            f'[ "$*" = "{words}" ] && exec {shlex.join(command)}'
+            for words, command in (("info demo", info), ("ask demo --stdin", ask))
+        )
+        (tmp_path / "lexsplat").write_text("\n".join([*lines, "exit 9"]))
+        done = subprocess.run(arguments, capture_output=True, text=True, env=environment, timeout=300)
     rows = [line.split("\t") for line in done.stdout.splitlines()]
     assert done.returncode == 0, done.stderr
     assert [row[0] for row in rows] == arguments[3:]

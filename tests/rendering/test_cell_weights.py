@@ -8,7 +8,7 @@ import torch
 from support import rendering_reference as reference
 from support.rendering_reference import front_camera, random_gaussians
 
-from lexsplat.rendering import back_project, prepare, weigh_cells
+from lexsplat.rendering import accumulate_weights, back_project, measure_weights, prepare, weigh_cells
 from lexsplat.rendering.back_projection import DenseCellWeights
 
 WIDTH, HEIGHT = 53, 37
@@ -81,6 +81,14 @@ def test_sparse_and_dense_weights_agree():
     torch.testing.assert_close(dense, straight)
     sparse = summed(gaussians, camera, (HEIGHT, WIDTH), counts, values)
     torch.testing.assert_close(sparse, dense, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_weights_that_are_measured_in_one_pass_are_those_of_the_transpose(antialiased):
+    gaussians, camera = random_gaussians(40, 9, antialiased=antialiased), front_camera(WIDTH, HEIGHT)
+    expected = accumulate_weights(gaussians, camera)
+    assert float(expected.max()) > 1
+    torch.testing.assert_close(measure_weights(gaussians, camera), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_a_view_of_nothing_adds_nothing():

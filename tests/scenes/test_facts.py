@@ -11,7 +11,8 @@ from lexsplat.scenes.folder import SceneFolder
 
 
 @pytest.mark.slow
-def test_facts_of_an_edited_scene_are_those_of_its_files(tmp_path, capsys):
+def test_facts_of_an_edited_scene_are_those_of_its_files(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("lexsplat.scenes.editing.keep_for", lambda *_: None)  # no question is asked of it
     opened = open_scene("demo", device="cpu")
     editor = Editor(opened)
     editor.delete(opened.find("red apple"))

@@ -185,8 +185,10 @@ def test_two_libraries_share_a_server_and_stay_apart(rooms, chroma, tmp_path):
     assert hits(second, "mug") == []
 
 
-def test_the_server_recalls_the_ten_best_of_five_hundred_mixed_scenes(chroma, tmp_path):
-    library = mixed_library(tmp_path / "library", 500, 8, 64)
+def test_the_server_recalls_the_ten_best_of_two_hundred_mixed_scenes(chroma, tmp_path, monkeypatch):
+    library = mixed_library(tmp_path / "library", 200, 8, 64)
+    # A quarter of the codes, as in a library of five hundred scenes: most scenes are not proposed.
+    monkeypatch.setattr("lexsplat.scenes.library.searching.PROPOSED", 400)
     served = Library(library.root, index=chroma.url)
     served.encode = library.encode
     served.server.repair([(record, served.codes(record)) for record in served.records()], served.stage)

@@ -167,9 +167,10 @@ class ClipEncoder(PretrainedModel):
     def _text_inputs(self, prompts: list[str]) -> dict[str, Tensor]:
         if self._siglip:  # trained on lower case with padding to full length, without an attention mask
             prompts = [prompt.lower() for prompt in prompts]
-        for prompt in prompts:
-            if over := self.tokens_over(prompt):
-                warn_truncated(prompt, self._text_length + over, self._text_length)
+        # At once: a call for each prompt would take as long as the model.
+        for prompt, ids in zip(prompts, self._tokenizer(prompts, verbose=False)["input_ids"]):
+            if len(ids) > self._text_length:
+                warn_truncated(prompt, len(ids), self._text_length)
         tokens = self._tokenizer(
             prompts,
             padding="max_length" if self._siglip else True,

@@ -20,7 +20,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.segments import Segments
 from lexsplat.queries.visibility import hidden_gaussians
-from lexsplat.rendering import accumulate_weights
+from lexsplat.rendering import measure_weights
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.sampling import evenly
 
@@ -141,7 +141,7 @@ class Seen:
             if not self._known[place]:
                 small = self._cameras[name].within(_LONG_SIDE)
                 with torch.no_grad():
-                    weights = accumulate_weights(self._gaussians, small).cpu().numpy()
+                    weights = measure_weights(self._gaussians, small).cpu().numpy()
                 covered = np.bincount(self._labels, weights, len(self._shares))
                 self._shares[:, place] = covered / (small.width * small.height)
                 self._known[place] = True

@@ -10,6 +10,7 @@ from lexsplat.rendering.back_projection import (
     BACK_PROJECTED_CHANNELS,
     accumulate_weights,
     back_project,
+    measure_weights,
     weigh_cells,
 )
 from lexsplat.rendering.compositing import prepare, render
@@ -22,6 +23,7 @@ __all__ = [
     "Rendering",
     "accumulate_weights",
     "back_project",
+    "measure_weights",
     "prepare",
     "render",
     "weigh_cells",

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.rendering import accumulate_weights, render
+from lexsplat.rendering import measure_weights, render
 from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.completing import mean_around
 
@@ -202,7 +202,7 @@ def seen_weights(gaussians: Gaussians, kept: Mask, cameras: Sequence[Camera]) ->
     """Visible weights of some Gaussians, drawn without the others, in some of the views, in their pixels ``[N]``."""
     drawn, weights = gaussians.select(torch.from_numpy(kept).to(gaussians.device)), np.zeros(len(kept))
     for camera in evenly(cameras, _VIEWS):
-        weights[kept] += accumulate_weights(drawn, camera.within(_LONG_SIDE)).cpu().double().numpy()
+        weights[kept] += measure_weights(drawn, camera.within(_LONG_SIDE)).cpu().double().numpy()
     return weights
 
 
