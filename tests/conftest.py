@@ -95,6 +95,12 @@ def tiny_capture(made_once) -> Path:
 
 
 @pytest.fixture(scope="session")
+def six_views(made_once) -> Path:
+    """Six of the views, of which two have masks: for tests of what is built and not of how well; read-only."""
+    return made_once("six_views", lambda folder: write_capture(folder, views=6))
+
+
+@pytest.fixture(scope="session")
 def built(tiny_capture, made_once, tmp_path_factory) -> Path:
     """A scene built from the tiny capture by the command line; its results must not be changed."""
     from lexsplat import cli

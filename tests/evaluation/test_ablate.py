@@ -12,7 +12,6 @@ from support.experiments import CONFIG
 from support.experiments import ablated as measure_variants
 from support.report_pages import Page
 from support.schemas import validated
-from support.tiny_capture import write_capture
 
 from lexsplat import cli
 from lexsplat.captures import Annotations
@@ -32,16 +31,10 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("color_encoders")]
 
 
 @pytest.fixture(scope="module")
-def tiny_capture(tmp_path_factory):
-    """Six of the views, of which two have masks."""
-    return write_capture(tmp_path_factory.mktemp("six") / "capture", views=6)
-
-
-@pytest.fixture(scope="module")
-def ablated(tiny_capture, tmp_path_factory):
+def ablated(six_views, tmp_path_factory):
     """All variants with two seeds."""
     folder = tmp_path_factory.mktemp("ablation")
-    measure_variants(tiny_capture, folder, CONFIG, AblationPlan(seeds=(0, 1)))
+    measure_variants(six_views, folder, CONFIG, AblationPlan(seeds=(0, 1)))
     return folder
 
 
@@ -89,31 +82,31 @@ def test_each_method_has_the_variants_that_change_it():
         ablation.changed(BuildConfig(), "w/o MLP")
 
 
-def test_a_variant_that_no_method_has_is_refused_before_any_work(tiny_capture, tmp_path):
+def test_a_variant_that_no_method_has_is_refused_before_any_work(six_views, tmp_path):
     for methods in (("averaged",), ("trained", "averaged")):
         with pytest.raises(ValueError, match="with neighbors"):
             measure_variants(
-                tiny_capture,
+                six_views,
                 tmp_path / "a",
                 CONFIG,
                 AblationPlan(methods=methods, variants=("with neighbors",)),
             )
     with pytest.raises(ValueError, match="averaged"):
         measure_variants(
-            tiny_capture, tmp_path / "a", CONFIG, AblationPlan(methods=("averaged",), variants=("w/o MLP",))
+            six_views, tmp_path / "a", CONFIG, AblationPlan(methods=("averaged",), variants=("w/o MLP",))
         )
     with pytest.raises(ValueError, match="lifted"):
-        measure_variants(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(methods=("lifted",)))
+        measure_variants(six_views, tmp_path / "a", CONFIG, AblationPlan(methods=("lifted",)))
     assert not (tmp_path / "a").exists()
 
 
 def test_several_methods_with_wrong_labels_and_a_variant_that_one_lacks(
-    ablated, tiny_capture, tmp_path, fits, caplog
+    ablated, six_views, tmp_path, fits, caplog
 ):
     shutil.copytree(ablated / "scene", tmp_path / "scene")
     methods = ("trained", "averaged")
     rows = measure_variants(
-        tiny_capture,
+        six_views,
         tmp_path,
         CONFIG,
         AblationPlan(seeds=(0,), methods=methods, variants=("full", "one code"), wrong_labels=0.3),
@@ -122,7 +115,7 @@ def test_several_methods_with_wrong_labels_and_a_variant_that_one_lacks(
     assert "trained has no variant 'one code': the row is left out" in caplog.text
     assert all(row["language_seconds"][0] > 0 and row["storage_bytes"][0] > 0 for row in rows)
     clean = measure_variants(
-        tiny_capture, tmp_path, CONFIG, AblationPlan(seeds=(0,), methods=methods, variants=("full",))
+        six_views, tmp_path, CONFIG, AblationPlan(seeds=(0,), methods=methods, variants=("full",))
     )
     assert len(fits) == 5, "other labels are other runs"
     wrong, right = fits[0][0].code_maps, fits[3][0].code_maps
@@ -131,10 +124,10 @@ def test_several_methods_with_wrong_labels_and_a_variant_that_one_lacks(
     assert rows[1]["mAP"] != clean[1]["mAP"]
 
 
-def test_a_language_is_made_once_and_measured_in_both_forms(ablated, tiny_capture, tmp_path, fits):
+def test_a_language_is_made_once_and_measured_in_both_forms(ablated, six_views, tmp_path, fits):
     shutil.copytree(ablated / "scene", tmp_path / "scene")
     rows = measure_variants(
-        tiny_capture,
+        six_views,
         tmp_path,
         CONFIG,
         AblationPlan(seeds=(0, 1), variants=("full",), forms=("feature", "code")),
@@ -151,7 +144,7 @@ def test_a_language_is_made_once_and_measured_in_both_forms(ablated, tiny_captur
     ]
     assert again["strict"] == known["strict"], "as if it stood alone"
     with pytest.raises(ValueError, match="form"):
-        measure_variants(tiny_capture, tmp_path, CONFIG, AblationPlan(forms=()))
+        measure_variants(six_views, tmp_path, CONFIG, AblationPlan(forms=()))
 
 
 def test_wrong_labels_differ_in_every_view_and_keep_their_share():
@@ -197,7 +190,7 @@ def test_codebooks_are_shared_where_the_quantization_is_the_same(ablated):
     assert len(list((ablated / "codebooks").glob("*.safetensors"))) == 6
 
 
-def test_memory_is_that_of_the_codebook_too_whoever_made_it(ablated, tiny_capture, tmp_path):
+def test_memory_is_that_of_the_codebook_too_whoever_made_it(ablated, six_views, tmp_path):
     shutil.copytree(ablated / "scene", tmp_path / "scene")
     shutil.copytree(ablated / "codebooks", tmp_path / "codebooks")
     for path in (tmp_path / "codebooks").iterdir():
@@ -205,18 +198,18 @@ def test_memory_is_that_of_the_codebook_too_whoever_made_it(ablated, tiny_captur
         peaks = json.loads(facts["peaks"])
         assert peaks["peak_rss_bytes"] is None or peaks["peak_rss_bytes"] > 1e7
         write_tensors(path, tensors, {**facts, "peaks": json.dumps({"peak_rss_bytes": 10**15})})
-    rows = measure_variants(tiny_capture, tmp_path, CONFIG, AblationPlan(seeds=(0,), variants=("full",)))
+    rows = measure_variants(six_views, tmp_path, CONFIG, AblationPlan(seeds=(0,), variants=("full",)))
     assert rows[0]["host_bytes"][0] in (None, 10**15)
 
 
-def test_codebook_and_language_receive_the_memory_budget(ablated, tiny_capture, tmp_path, monkeypatch, fits):
+def test_codebook_and_language_receive_the_memory_budget(ablated, six_views, tmp_path, monkeypatch, fits):
     shutil.copytree(ablated / "scene", tmp_path / "scene")
     granted, fit = [], experiments.fit_codebook
     monkeypatch.setattr(
         experiments, "fit_codebook", lambda *a, **k: granted.append(k["memory"]) or fit(*a, **k)
     )
     config = replace(CONFIG, memory="800MB")
-    measure_variants(tiny_capture, tmp_path, config, AblationPlan(seeds=(0,), variants=("full",)))
+    measure_variants(six_views, tmp_path, config, AblationPlan(seeds=(0,), variants=("full",)))
     assert [*granted, fits[0][2].memory] == [parse_bytes("800MB")] * 2
 
 
@@ -226,14 +219,14 @@ def test_seeds_differ_and_the_gaussians_are_shared(ablated):
     assert full[0]["metrics"]["language"] != full[1]["metrics"]["language"]
 
 
-def test_an_interrupted_ablation_makes_only_what_is_missing(ablated, tiny_capture, fits):
+def test_an_interrupted_ablation_makes_only_what_is_missing(ablated, six_views, fits):
     before = rows_of(ablated)
     missing = ablated / "runs" / "w_o_MLP" / "seed-1.json"
     language = json.loads(missing.read_text())["metrics"]["language"]
     missing.unlink()
     (ablated / "runs" / "full" / "seed-0.json").write_text("{")  # damaged
     next((ablated / "codebooks").glob("*.safetensors")).write_bytes(b"damaged")
-    measure_variants(tiny_capture, ablated, CONFIG, AblationPlan(seeds=(0, 1)))
+    measure_variants(six_views, ablated, CONFIG, AblationPlan(seeds=(0, 1)))
     assert [run.seed for _, _, run in fits] == [0, 1]
     again = json.loads(missing.read_text())["metrics"]["language"]
     assert again == language, "the same seed gives the same numbers"
@@ -243,18 +236,18 @@ def test_an_interrupted_ablation_makes_only_what_is_missing(ablated, tiny_captur
         assert values[0] == values[1], name
 
 
-def test_another_version_of_the_code_measures_again(ablated, tiny_capture, tmp_path, monkeypatch, fits):
+def test_another_version_of_the_code_measures_again(ablated, six_views, tmp_path, monkeypatch, fits):
     output = shutil.copytree(ablated, tmp_path / "ablated")
     monkeypatch.setattr(experiments, "code_identity", lambda: "another")
-    measure_variants(tiny_capture, output, CONFIG, AblationPlan(variants=("full",), seeds=(0,)))
+    measure_variants(six_views, output, CONFIG, AblationPlan(variants=("full",), seeds=(0,)))
     assert [run.seed for _, _, run in fits] == [0]
 
 
-def test_missing_seeds_and_unknown_variants_are_refused_before_any_work(tiny_capture, tmp_path):
+def test_missing_seeds_and_unknown_variants_are_refused_before_any_work(six_views, tmp_path):
     with pytest.raises(ValueError, match="seed"):
-        measure_variants(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(seeds=()))
+        measure_variants(six_views, tmp_path / "a", CONFIG, AblationPlan(seeds=()))
     with pytest.raises(ValueError, match="variants"):
-        measure_variants(tiny_capture, tmp_path / "a", CONFIG, AblationPlan(variants=("w/o all",)))
+        measure_variants(six_views, tmp_path / "a", CONFIG, AblationPlan(variants=("w/o all",)))
     assert not (tmp_path / "a").exists()
 
 
@@ -266,16 +259,16 @@ def test_what_is_given_twice_is_refused_because_its_spread_would_be_none(plan):
         AblationPlan(**plan)
 
 
-def test_a_capture_without_masks_cannot_be_ablated(ablated, tiny_capture, monkeypatch):
-    empty = Annotations("segmentations", tiny_capture, {})
+def test_a_capture_without_masks_cannot_be_ablated(ablated, six_views, monkeypatch):
+    empty = Annotations("segmentations", six_views, {})
     monkeypatch.setattr("lexsplat.evaluation.ground_truth.load_annotations", lambda *a: empty)
     with pytest.raises(CaptureError, match="STEM/PROMPT"):
-        measure_variants(tiny_capture, ablated, replace(CONFIG, seed=0))
+        measure_variants(six_views, ablated, replace(CONFIG, seed=0))
 
 
-def test_runs_are_kept_for_equal_ground_truth_and_prompts_only(tiny_capture, tmp_path, fits):
+def test_runs_are_kept_for_equal_ground_truth_and_prompts_only(six_views, tmp_path, fits):
     capture, ground_truth = tmp_path / "counter", tmp_path / "ground_truth"
-    shutil.copytree(tiny_capture, capture)
+    shutil.copytree(six_views, capture)
     for folder in (
         capture / "segmentations"
     ).iterdir():  # not compressed: masks of one size have files of one size
@@ -334,16 +327,16 @@ def test_runs_are_kept_for_equal_ground_truth_and_prompts_only(tiny_capture, tmp
     ],
 )
 def test_unavailable_ground_truth_is_refused_before_any_work(
-    tiny_capture, tmp_path, capsys, command, option, message
+    six_views, tmp_path, capsys, command, option, message
 ):
     output = tmp_path / "out"
-    assert cli.main([command, str(tiny_capture), "--output", str(output), *option]) == 1
+    assert cli.main([command, str(six_views), "--output", str(output), *option]) == 1
     assert message in capsys.readouterr().err
     assert not output.exists()
 
 
 @pytest.mark.parametrize("command", ["ablate", "compare"])
-def test_the_command_line_passes_ground_truth_and_protocols(tiny_capture, tmp_path, monkeypatch, command):
+def test_the_command_line_passes_ground_truth_and_protocols(six_views, tmp_path, monkeypatch, command):
     from lexsplat.evaluation import compare as comparison
     from lexsplat.evaluation import experiments
 
@@ -357,7 +350,7 @@ def test_the_command_line_passes_ground_truth_and_protocols(tiny_capture, tmp_pa
     monkeypatch.setattr(module, command, lambda *a, **k: [])
     arguments = ["--ground-truth", str(tmp_path), "--prompt-list", "released"]
     arguments += ["--protocols", "strict", "lerf-2d"] if command == "compare" else []
-    assert cli.main([command, str(tiny_capture), "--output", str(tmp_path / "out"), *arguments]) == 0
+    assert cli.main([command, str(six_views), "--output", str(tmp_path / "out"), *arguments]) == 0
     assert used["ground_truth"] == GroundTruthSource(tmp_path, "released")
     if command == "compare":
         assert used["evaluation"].protocols == ("strict", "lerf-2d")

@@ -1,5 +1,8 @@
 """The report is readable in a real browser, wide and narrow."""
 
+from collections.abc import Iterator
+from typing import Any
+
 import pytest
 from support.page_browser import CHROMIUM
 from support.report_pages import evaluated
@@ -28,7 +31,7 @@ def reports(tmp_path_factory):
 
 
 @pytest.fixture(scope="module", params=[1280, 400])
-def opened(request, browser, reports):
+def opened(request, browser, reports) -> Iterator[Any]:
     """The report in a window of some width; failed requests and console messages are in ``refused``."""
     page = browser.new_page(viewport={"width": request.param, "height": 800})
     page.refused = []

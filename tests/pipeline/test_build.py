@@ -10,7 +10,6 @@ from dataclasses import replace
 import pytest
 from support import color_encoder
 from support.experiments import CONFIG
-from support.tiny_capture import write_capture
 
 from lexsplat.language.methods import JOINT_METHODS, METHODS, MethodName
 from lexsplat.language.methods.averaged import Averaged, AveragedConfig
@@ -29,17 +28,11 @@ TRAINED = replace(CONFIG, iterations=4)
 
 
 @pytest.fixture(scope="module")
-def tiny_capture(tmp_path_factory):
-    """Six of the views: what is built matters, not how well."""
-    return write_capture(tmp_path_factory.mktemp("six") / "capture", views=6)
-
-
-@pytest.fixture(scope="module")
-def built_by_method(tiny_capture, tmp_path_factory):
+def built_by_method(six_views, tmp_path_factory):
     """A scene by each method; its files must not be changed."""
     folder = tmp_path_factory.mktemp("scenes")
     for config in (AVERAGED, TRAINED):
-        build(tiny_capture, folder / config.method, config)
+        build(six_views, folder / config.method, config)
     return folder
 
 
@@ -77,25 +70,25 @@ def test_every_method_has_a_name_that_settings_accept_and_stages_that_exist():
 
 @pytest.mark.parametrize("config", [AVERAGED, TRAINED], ids=lambda config: config.method)
 def test_stages_are_those_of_the_method_and_a_second_build_keeps_all(
-    built_by_method, tiny_capture, tmp_path, config
+    built_by_method, six_views, tmp_path, config
 ):
     expected = ["reconstruct", *METHODS[config.method].needs, "language"]
     record = SceneFolder.open(built_by_method / config.method).record
     assert list(record["stages"]) == expected
     assert record["stages"]["language"]["method"] == config.method
     copy = shutil.copytree(built_by_method / config.method, tmp_path / "copy")
-    assert stages_run(tiny_capture, copy, config) == dict.fromkeys(expected, True)
+    assert stages_run(six_views, copy, config) == dict.fromkeys(expected, True)
 
 
 def test_a_scene_names_the_method_that_made_it_whatever_its_field_says(
-    built_by_method, tiny_capture, tmp_path, monkeypatch
+    built_by_method, six_views, tmp_path, monkeypatch
 ):
     class Toy(Averaged):
         name = "toy"
 
     monkeypatch.setitem(METHODS, "toy", Toy())
     copy = shutil.copytree(built_by_method / "averaged", tmp_path / "copy")
-    build(tiny_capture, copy, replace(AVERAGED, method="toy"))
+    build(six_views, copy, replace(AVERAGED, method="toy"))
     scene = open_scene(copy, device="cpu")
     assert scene.field.method == scene.folder.record["stages"]["language"]["method"] == "toy"
 
@@ -118,42 +111,42 @@ def test_a_scene_names_the_method_that_made_it_whatever_its_field_says(
     ],
 )
 def test_a_changed_setting_redoes_what_depends_on_it(
-    built_by_method, tiny_capture, tmp_path, base, change, redone
+    built_by_method, six_views, tmp_path, base, change, redone
 ):
     copy = shutil.copytree(built_by_method / base.method, tmp_path / "copy")
-    finished = stages_run(tiny_capture, copy, replace(base, **change))
+    finished = stages_run(six_views, copy, replace(base, **change))
     assert {name for name, kept in finished.items() if not kept} == redone
 
 
-def test_a_missing_result_is_made_again(built_by_method, tiny_capture, tmp_path):
+def test_a_missing_result_is_made_again(built_by_method, six_views, tmp_path):
     copy = shutil.copytree(built_by_method / "averaged", tmp_path / "copy")
     (copy / "language.safetensors").unlink()
-    finished = stages_run(tiny_capture, copy, AVERAGED)
+    finished = stages_run(six_views, copy, AVERAGED)
     assert finished == {"reconstruct": True, "features": True, "language": False}
     for name in ("gaussians.ply", "language.safetensors"):
         assert (copy / name).read_bytes()[-500:] == (built_by_method / "averaged" / name).read_bytes()[-500:]
 
 
-def test_a_build_stops_after_the_stage_asked_for(tiny_capture, tmp_path):
-    folder = build(tiny_capture, tmp_path / "scene", AVERAGED, until="codebook")
+def test_a_build_stops_after_the_stage_asked_for(six_views, tmp_path):
+    folder = build(six_views, tmp_path / "scene", AVERAGED, until="codebook")
     assert list(folder.record["stages"]) == ["reconstruct", "features"], "this method has no codebook stage"
     with pytest.raises(ValueError, match="until must be one of reconstruct"):
-        build(tiny_capture, tmp_path / "other", AVERAGED, until="embed")
+        build(six_views, tmp_path / "other", AVERAGED, until="embed")
     assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.slow
-def test_joint_training_makes_features_and_codes_before_the_geometry(tiny_capture, tmp_path):
+def test_joint_training_makes_features_and_codes_before_the_geometry(six_views, tmp_path):
     joint = replace(TRAINED, joint=True)
-    finished = stages_run(tiny_capture, tmp_path / "scene", joint)
+    finished = stages_run(six_views, tmp_path / "scene", joint)
     assert list(finished) == ["features", "codebook", "reconstruct", "language"]
     record = SceneFolder.open(tmp_path / "scene").record["stages"]
     assert (record["language"]["method"], record["reconstruct"]["joint"]) == ("trained", True)
-    assert stages_run(tiny_capture, tmp_path / "scene", joint) == dict.fromkeys(finished, True)
+    assert stages_run(six_views, tmp_path / "scene", joint) == dict.fromkeys(finished, True)
     changed = replace(joint, trained=replace(CONFIG.trained, iterations=3))
-    assert not stages_run(tiny_capture, tmp_path / "scene", changed)["reconstruct"]
+    assert not stages_run(six_views, tmp_path / "scene", changed)["reconstruct"]
     with pytest.raises(ValueError, match="leave --splats out"):
-        build(tiny_capture, tmp_path / "other", joint, splats=tmp_path / "any.ply")
+        build(six_views, tmp_path / "other", joint, splats=tmp_path / "any.ply")
 
 
 @pytest.fixture
@@ -183,27 +176,27 @@ def loaded(tmp_path, monkeypatch) -> list[str]:
     ids=["trained", "averaged from class tokens", "averaged without DINO"],
 )
 def test_a_build_loads_each_encoder_once_for_check_photos_and_texts(
-    tiny_capture, tmp_path, loaded, config, expected
+    six_views, tmp_path, loaded, config, expected
 ):
-    build(tiny_capture, tmp_path / "scene", config)
+    build(six_views, tmp_path / "scene", config)
     assert sorted(loaded) == expected
     kept = tmp_path / "scene" / "checkpoints" / "texts"
     assert list(kept.iterdir()), "texts were encoded"
     loaded.clear()
-    build(tiny_capture, tmp_path / "scene", config)
+    build(six_views, tmp_path / "scene", config)
     assert loaded == [], "all results are there"
 
 
 def test_new_settings_of_the_language_load_no_encoder_where_codes_are_kept(
-    built_by_method, tiny_capture, tmp_path, loaded
+    built_by_method, six_views, tmp_path, loaded
 ):
     copy = shutil.copytree(built_by_method / "trained", tmp_path / "copy")
-    build(tiny_capture, copy, replace(TRAINED, trained=TrainedConfig(iterations=2)))
+    build(six_views, copy, replace(TRAINED, trained=TrainedConfig(iterations=2)))
     assert loaded == []
 
 
 @pytest.mark.slow
-def test_the_encoder_of_photos_is_freed_before_the_language_is_made(tiny_capture, tmp_path, monkeypatch):
+def test_the_encoder_of_photos_is_freed_before_the_language_is_made(six_views, tmp_path, monkeypatch):
     made, alive = [], []
 
     def load(*_):
@@ -218,12 +211,12 @@ def test_the_encoder_of_photos_is_freed_before_the_language_is_made(tiny_capture
 
     monkeypatch.setattr("lexsplat.features.encoders.load_dino", load)
     monkeypatch.setattr(Trained, "fit", fit)
-    build(tiny_capture, tmp_path / "scene", TRAINED)
+    build(six_views, tmp_path / "scene", TRAINED)
     assert alive == [None]
 
 
 @pytest.mark.slow
-def test_every_stage_receives_the_memory_budget(tiny_capture, tmp_path, monkeypatch):
+def test_every_stage_receives_the_memory_budget(six_views, tmp_path, monkeypatch):
     granted = {}
     for module, name in ((geometry, "reconstruct"), (pipeline, "fit_codebook")):
         original = getattr(module, name)
@@ -241,16 +234,14 @@ def test_every_stage_receives_the_memory_budget(tiny_capture, tmp_path, monkeypa
 
         monkeypatch.setattr(method, "fit", fit)
     for config in (AVERAGED, TRAINED):
-        build(tiny_capture, tmp_path / config.method, replace(config, memory="900MB"))
+        build(six_views, tmp_path / config.method, replace(config, memory="900MB"))
     assert granted == dict.fromkeys(
         ("reconstruct", "fit_codebook", "averaged", "trained"), parse_bytes("900MB")
     )
 
 
-def test_the_record_lists_the_stages_in_their_order_whichever_ran_again(
-    built_by_method, tiny_capture, tmp_path
-):
+def test_the_record_lists_the_stages_in_their_order_whichever_ran_again(built_by_method, six_views, tmp_path):
     copy = shutil.copytree(built_by_method / "averaged", tmp_path / "copy")
-    folder = build(tiny_capture, copy, replace(AVERAGED, iterations=5))
+    folder = build(six_views, copy, replace(AVERAGED, iterations=5))
     assert list(folder.record["stages"]) == ["reconstruct", "features", "language"]
     assert list(SceneFolder.open(copy).record["stages"]) == ["reconstruct", "features", "language"]

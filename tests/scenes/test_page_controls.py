@@ -43,7 +43,7 @@ def opened(browser, address) -> Iterator[Any]:
 
 
 @pytest.fixture
-def page(opened) -> Any:
+def cleared(opened) -> Any:
     """A page without answers and open lists."""
     opened.evaluate("lexsplat.app.clear()")
     opened.locator(".search input").fill("")
@@ -80,19 +80,19 @@ def test_on_a_phone_the_keyboard_and_the_panels_go_away_after_a_choice(browser, 
     page.close()
 
 
-def test_on_a_computer_the_box_and_the_panels_stay(page):
-    ask(page, "ball 2")
-    assert page.evaluate("document.activeElement.tagName") == "INPUT"
-    page.evaluate(LIST)
-    page.locator(".tools").get_by_label("Objects in this scene").click()
-    page.locator(".objects li button").first.click()
-    assert page.locator(".objects").is_visible()
+def test_on_a_computer_the_box_and_the_panels_stay(cleared):
+    ask(cleared, "ball 2")
+    assert cleared.evaluate("document.activeElement.tagName") == "INPUT"
+    cleared.evaluate(LIST)
+    cleared.locator(".tools").get_by_label("Objects in this scene").click()
+    cleared.locator(".objects li button").first.click()
+    assert cleared.locator(".objects").is_visible()
 
 
-def test_opening_one_list_closes_the_other(page):
-    page.evaluate(LIST)
+def test_opening_one_list_closes_the_other(cleared):
+    cleared.evaluate(LIST)
     objects, views = (
-        page.locator(".tools").get_by_label(name) for name in ("Objects in", "Where the photos")
+        cleared.locator(".tools").get_by_label(name) for name in ("Objects in", "Where the photos")
     )
     for opened, other in ((objects, views), (views, objects), (objects, views)):
         opened.click()
@@ -100,37 +100,37 @@ def test_opening_one_list_closes_the_other(page):
             "true",
             "false",
         )
-        assert page.locator("aside.views").filter(visible=True).count() == 1
+        assert cleared.locator("aside.views").filter(visible=True).count() == 1
 
 
-def test_the_threshold_is_dragged_with_a_pause_and_the_color_stays_under_the_hand(page):
-    ask(page, "ball 2")
-    slider = page.locator(".threshold input")
-    page.evaluate("window.before = [...document.querySelectorAll('.threshold input, .swatch')]")
+def test_the_threshold_is_dragged_with_a_pause_and_the_color_stays_under_the_hand(cleared):
+    ask(cleared, "ball 2")
+    slider = cleared.locator(".threshold input")
+    cleared.evaluate("window.before = [...document.querySelectorAll('.threshold input, .swatch')]")
     box = slider.bounding_box()
     y = box["y"] + box["height"] / 2
-    page.mouse.move(box["x"] + 0.5 * box["width"], y)
-    page.mouse.down()
-    page.mouse.move(box["x"] + 0.7 * box["width"], y)
-    until(page, "lexsplat.app.answers[0].places !== null && lexsplat.app.answers[0].threshold > 0.6")
-    page.wait_for_timeout(400)
-    page.mouse.move(box["x"] + 0.2 * box["width"], y)
-    page.mouse.up()
-    assert 0.1 < page.evaluate("lexsplat.app.answers[0].threshold") < 0.3
-    until(page, "lexsplat.app.answers[0].places !== null")
-    page.locator(".swatch").fill("#112233")
-    page.wait_for_timeout(300)
-    assert page.evaluate("window.before.every((one) => one.isConnected)")
-    page.get_by_role("button", name="Automatic").click()
-    assert page.evaluate("lexsplat.app.answers[0].threshold === lexsplat.app.answers[0].automatic")
-    page.get_by_label("Hide ball 2").click()
-    assert page.locator(".threshold").is_hidden()
-    page.get_by_label("Show ball 2").click()
-    assert page.locator(".threshold").is_visible()
+    cleared.mouse.move(box["x"] + 0.5 * box["width"], y)
+    cleared.mouse.down()
+    cleared.mouse.move(box["x"] + 0.7 * box["width"], y)
+    until(cleared, "lexsplat.app.answers[0].places !== null && lexsplat.app.answers[0].threshold > 0.6")
+    cleared.wait_for_timeout(400)
+    cleared.mouse.move(box["x"] + 0.2 * box["width"], y)
+    cleared.mouse.up()
+    assert 0.1 < cleared.evaluate("lexsplat.app.answers[0].threshold") < 0.3
+    until(cleared, "lexsplat.app.answers[0].places !== null")
+    cleared.locator(".swatch").fill("#112233")
+    cleared.wait_for_timeout(300)
+    assert cleared.evaluate("window.before.every((one) => one.isConnected)")
+    cleared.get_by_role("button", name="Automatic").click()
+    assert cleared.evaluate("lexsplat.app.answers[0].threshold === lexsplat.app.answers[0].automatic")
+    cleared.get_by_label("Hide ball 2").click()
+    assert cleared.locator(".threshold").is_hidden()
+    cleared.get_by_label("Show ball 2").click()
+    assert cleared.locator(".threshold").is_visible()
 
 
-def test_of_two_quick_questions_the_later_one_stays_whichever_is_answered_first(page):
-    until(page, "lexsplat.app.source !== null")
+def test_of_two_quick_questions_the_later_one_stays_whichever_is_answered_first(cleared):
+    until(cleared, "lexsplat.app.source !== null")
     slow = """async (slow) => {
         const { source } = lexsplat.app;
         const answer = source.constructor.prototype.answer;
@@ -145,7 +145,7 @@ def test_of_two_quick_questions_the_later_one_stays_whichever_is_answered_first(
         return [shown, answers.map((one) => one.prompt), new Set(answers.map((one) => one.color)).size];
     }"""
     for late in ("ball 1", "ball 2"):
-        assert page.evaluate(slow, late) == [["ball 2"], ["ball 2", "ball 3", "ball 4"], 3]
+        assert cleared.evaluate(slow, late) == [["ball 2"], ["ball 2", "ball 3", "ball 4"], 3]
 
 
 def test_every_tool_can_be_pressed_on_small_windows_also_with_answers(tab, address):
@@ -183,10 +183,10 @@ def test_a_page_that_draws_nothing_answers_all_the_same(browser, address):
     page.close()
 
 
-def test_the_closed_completions_are_no_stop_of_the_tab_key_and_the_box_takes_what_the_server_takes(page):
-    until(page, "lexsplat.app.source !== null")
-    page.locator(".search input").focus()
-    page.keyboard.type("ball")
-    page.keyboard.press("Tab")
-    assert page.evaluate("document.activeElement.tagName") == "BUTTON"
-    assert page.locator(".search input").get_attribute("maxlength") == str(MAX_LENGTH)
+def test_the_closed_completions_are_no_stop_of_the_tab_key_and_the_box_takes_what_the_server_takes(cleared):
+    until(cleared, "lexsplat.app.source !== null")
+    cleared.locator(".search input").focus()
+    cleared.keyboard.type("ball")
+    cleared.keyboard.press("Tab")
+    assert cleared.evaluate("document.activeElement.tagName") == "BUTTON"
+    assert cleared.locator(".search input").get_attribute("maxlength") == str(MAX_LENGTH)
