@@ -37,8 +37,8 @@ def room(tmp_path_factory):
     for index, camera in enumerate(room_cameras()):
         save(folder / f"{index}.png", room_photo(camera))
     save(folder / "unrelated.png", np.full((SIZE[1], SIZE[0], 3), 0.5))
-    events = []
-    return folder, poses_from_photos(folder, tmp_path_factory.mktemp("poses"), listener=events.append), events
+    events, output, config = [], tmp_path_factory.mktemp("poses"), PoseConfig(max_features=FEW)
+    return folder, poses_from_photos(folder, output, config, listener=events.append), events
 
 
 def test_photos_are_registered_and_the_unregistered_one_is_named(room):
@@ -77,7 +77,7 @@ def test_each_unregistered_photo_has_its_reason(room, tmp_path):
     for index in range(4):
         shutil.copy(folder / f"{index}.png", tmp_path)
     save(tmp_path / "noise.png", noise)
-    found = poses_from_photos(tmp_path, tmp_path / "out")
+    found = poses_from_photos(tmp_path, tmp_path / "out", PoseConfig(max_features=FEW))
     assert found.note.endswith("unregistered: noise.png (matches no other photo)")
 
 
@@ -323,7 +323,7 @@ def test_forward_facing_photos_are_registered_by_a_more_lenient_mapper(tmp_path)
     ]
     for index, camera in enumerate(cameras):
         save(tmp_path / "photos" / f"{index}.png", room_photo(camera))
-    poses = poses_from_photos(tmp_path / "photos", tmp_path / "out")
+    poses = poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig(max_features=FEW))
     assert len(poses.registered) == len(cameras)
     assert poses.mapper != "incremental"
     assert f'found by the mapper "{poses.mapper}"' in poses.note

@@ -12,6 +12,7 @@ from support.experiments import CONFIG
 from support.experiments import ablated as measure_variants
 from support.report_pages import Page
 from support.schemas import validated
+from support.tiny_capture import write_capture
 
 from lexsplat import cli
 from lexsplat.captures import Annotations
@@ -28,6 +29,12 @@ from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.memory import parse_bytes
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("color_encoders")]
+
+
+@pytest.fixture(scope="module")
+def tiny_capture(tmp_path_factory):
+    """Six of the views, of which two have masks."""
+    return write_capture(tmp_path_factory.mktemp("six") / "capture", views=6)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """Whatever a file contains, a reader returns a valid result or raises a typed error of one line.
 
-`support.hostile` registers every reader with a valid input and its mutations. They run in two processes with one
+`support.hostile` registers every reader with a valid input and its mutations. They run in two forks with one
 gigabyte of spare memory and a few seconds per input; a crash, a hang or another exception fails the reader's test.
 """
 
@@ -9,15 +9,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-from support import TESTS_ON_PATH
-from support.hostile import READERS, mutations
+from support.forked_commands import Command
+from support.hostile import READERS, mutations, running
 from support.hostile.running import BASE_BYTES, GIGABYTE
 from support.hostile.scenes import check_open_scene
 from support.tiny_capture import write_capture
@@ -46,31 +44,29 @@ def corpus(tmp_path_factory):
     base = tmp_path_factory.mktemp("hostile")
     claims = base / "claims"
     claims.mkdir()
-    environment = {**os.environ, **TESTS_ON_PATH, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     runs = []
     for number in range(PROCESSES):
         # A folder in memory: ten thousand small files would otherwise wait for a disk.
         work = (shared if os.access(shared, os.W_OK) else base) / f"lexsplat-hostile-{os.getpid()}-{number}"
         output = base / f"{number}.json"
-        command = [sys.executable, "-m", "support.hostile.running", *map(str, (work, output, claims))]
-        with open(output.with_suffix(".log"), "w") as log:
-            process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
-        runs.append((process, work, output))
+        words = map(str, (work, output, claims))
+        runs.append((Command(*words, program=running.main, heard=False), work, output))
     reports = {}
     for process, work, output in runs:
         try:
-            process.wait(timeout=1500)
+            status = process.wait(1500)
         finally:
-            process.kill()
+            process.__exit__()
             shutil.rmtree(work, ignore_errors=True)
         if output.exists():
             reports.update(json.loads(output.read_text()))
-        if process.returncode:
+        if status:
             current = output.with_suffix(".current")
             tried = current.read_text().strip() if current.exists() else ""
-            last = output.with_suffix(".log").read_text(errors="replace")[-2000:]
             tried = tried or "the start"
-            reports[tried.split()[0]] = {"crash": f"ended with {process.returncode} at {tried}: {last}"}
+            reports[tried.split()[0]] = {
+                "crash": f"ended with {status} at {tried}: {process.errors()[-2000:]}"
+            }
     return reports
 
 

@@ -17,8 +17,8 @@ from lexsplat.runtime.training import Checkpoint
 
 pytestmark = pytest.mark.slow
 
-STEPS = 80
-GEOMETRY = ReconstructionConfig(iterations=STEPS, sh_degree=1, densify_min_every=10, max_gaussians=3000)
+STEPS = 40
+GEOMETRY = ReconstructionConfig(iterations=STEPS, sh_degree=1, densify_min_every=5, max_gaussians=3000)
 LANGUAGE = TrainedConfig(pixel_sample=256, smoothing_sample=64)
 CODES = 4
 
@@ -113,9 +113,10 @@ def test_the_command_line_trains_jointly(tiny_capture, tmp_path):
     from lexsplat import cli, open_scene
 
     output = tmp_path / "scene"
-    options = ["--clip", "bundled", "--dino", "none", "--device", "cpu", "--iterations", "60",
-               "--codebook.num-codes", "8", "--method", "trained", "--joint", "--downscale", "2",
-               "--features.crop-sizes", "0.36", "--features.crop-strides", "0.5"]  # fmt: skip
+    options = ["--clip", "bundled", "--dino", "none", "--device", "cpu", "--iterations", "20",
+               "--codebook.num-codes", "8", "--codebook.steps", "5", "--method", "trained", "--joint",
+               "--downscale", "2", "--features.crop-sizes", "0.5",
+               "--features.crop-strides", "0.5"]  # fmt: skip
     assert cli.main(["build", str(tiny_capture), "--output", str(output), *options]) == 0
     stages = json.loads((output / "scene.json").read_text())["stages"]
     assert list(stages) == ["features", "codebook", "reconstruct", "language"]

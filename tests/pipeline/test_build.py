@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 from support import color_encoder
 from support.experiments import CONFIG
+from support.tiny_capture import write_capture
 
 from lexsplat.language.methods import JOINT_METHODS, METHODS, MethodName
 from lexsplat.language.methods.averaged import Averaged, AveragedConfig
@@ -25,6 +26,12 @@ pytestmark = pytest.mark.usefixtures("color_encoders")
 
 AVERAGED = replace(CONFIG, method="averaged", iterations=4)
 TRAINED = replace(CONFIG, iterations=4)
+
+
+@pytest.fixture(scope="module")
+def tiny_capture(tmp_path_factory):
+    """Six of the views: what is built matters, not how well."""
+    return write_capture(tmp_path_factory.mktemp("six") / "capture", views=6)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from support.blind_workers import BlindWorkers
 from support.color_encoder import ColorClip, ColorDino
 from support.language_scene import make_scene
 from support.schemas import SCHEMAS
-from support.tiny_capture import QUICK_BUILD, write_capture
+from support.tiny_capture import write_capture
 
 from lexsplat import cli
 from lexsplat.captures import Capture, load_capture
@@ -34,6 +34,11 @@ from lexsplat.runtime.progress import Event
 from lexsplat.runtime.workers import ANY_MACHINE, IN_PROCESS, InProcess, SharedFolder
 
 CONFIG = BuildConfig(device="cpu", encoder_device="cpu")
+SMALL_BUILD = [
+    "--clip", "bundled", "--dino", "none", "--device", "cpu", "--iterations", "20", "--downscale", "2",
+    "--features.crop-sizes", "0.5", "--features.crop-strides", "0.5",
+]  # fmt: skip
+"""Options for scenes of which only the files matter."""
 
 
 class Encoders:
@@ -179,7 +184,7 @@ def test_relative_paths_serve_workers_with_another_working_folder(tmp_path, monk
     monkeypatch.chdir(tmp_path)
     workers = ElsewhereWorkers(tmp_path / "elsewhere")
     monkeypatch.setattr(build, "open_workers", functools.partial(opened, workers))
-    made = ["build", "capture", "--output", "scene", *QUICK_BUILD, "--workers", "ray", "--blocks", "2"]
+    made = ["build", "capture", "--output", "scene", *SMALL_BUILD, "--workers", "ray", "--blocks", "2"]
     assert cli.main(made) == 0
     assert "scene: finished reconstruct, features, language" in capsys.readouterr().out.splitlines()
     assert (tmp_path / "scene" / "language.safetensors").exists()
@@ -241,7 +246,7 @@ def test_what_killed_commands_left_is_removed_when_it_serves_no_more(tiny_captur
     for path in (left, mark, above):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
-    assert cli.main(["reconstruct", str(tiny_capture), "--output", str(output), *QUICK_BUILD]) == 0
+    assert cli.main(["reconstruct", str(tiny_capture), "--output", str(output), *SMALL_BUILD]) == 0
     assert not left.parent.exists()
     assert not mark.exists()
     assert not above.exists()
@@ -298,7 +303,7 @@ def test_many_captures_make_many_scenes_and_one_that_fails_is_reported(tmp_path,
         write_capture(tmp_path / "captures" / name, views=4)
     (tmp_path / "captures" / "attic").mkdir()
     rooms = [str(path) for path in sorted((tmp_path / "captures").iterdir())]
-    arguments = ["build", *rooms, "--output", str(tmp_path / "scenes"), *QUICK_BUILD]
+    arguments = ["build", *rooms, "--output", str(tmp_path / "scenes"), *SMALL_BUILD]
     assert cli.main(arguments) == 1
     said = capsys.readouterr()
     assert "error: " in said.err
@@ -316,11 +321,11 @@ def test_progress_as_json_is_one_event_a_line_in_its_schema(tiny_capture, tmp_pa
     from jsonschema import Draft202012Validator
 
     schema = Draft202012Validator(json.loads((SCHEMAS / "progress.json").read_text()))
-    arguments = ["reconstruct", str(tiny_capture), "--output", str(tmp_path / "s"), *QUICK_BUILD]
+    arguments = ["reconstruct", str(tiny_capture), "--output", str(tmp_path / "s"), *SMALL_BUILD]
     assert cli.main([*arguments, "--progress", "json"]) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert {event["stage"] for event in events} == {"reconstruct"}
     for event in events:
         schema.validate(event)
-    assert events[-1]["done"] == events[-1]["total"] == 120
+    assert events[-1]["done"] == events[-1]["total"] == 20
     assert events[-1]["seconds_left"] == 0

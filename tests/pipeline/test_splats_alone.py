@@ -34,7 +34,8 @@ solid = partial(made.solid, log_size=0.0)
 @pytest.fixture(autouse=True)
 def _few_candidates(monkeypatch) -> None:
     """Choices of a test take seconds."""
-    monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 60)
+    monkeypatch.setattr(choosing, "SIZE", (240, 180))
+    monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 30)
     monkeypatch.setattr(candidates, "_MOST_PLACES", 10)
 
 

@@ -15,6 +15,7 @@ import sys
 import torch
 from lexsplat.captures import load_capture
 from lexsplat.captures.sfm.triangulation import initial_points
+from lexsplat.language.fields.smoothing import mlp
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor, first_run
 from lexsplat.rendering.kernels import jit
 
@@ -28,17 +29,31 @@ trainer = Reconstructor(capture, ReconstructionConfig(iterations=4, warm_up=0.5)
 for _ in range(4):
     trainer.step()
 print(len(before), sorted(used() - before))
+mlp((3, 4, 2), None)
+print([name for name in ("torch._dynamo", "sympy") if name in sys.modules])
 """
 
 
-@pytest.mark.slow
-def test_a_training_needs_no_kernel_that_was_not_compiled_before_it(tmp_path):
-    capture = write_capture(tmp_path / "capture", views=4, width=64, height=48)
+@pytest.fixture(scope="module")
+def told(tmp_path_factory) -> list[str]:
+    """The lines that a training prints in a new process."""
+    capture = write_capture(tmp_path_factory.mktemp("first") / "capture", views=4, width=64, height=48)
     (run,) = run_warm(Stage(["torch"], [[Program(TRAINING, [str(capture)])]]))
     assert run.status == 0, run.err
-    count, missing = run.out.split(maxsplit=1)
+    return run.out.splitlines()
+
+
+@pytest.mark.slow
+def test_a_training_needs_no_kernel_that_was_not_compiled_before_it(told):
+    count, missing = told[0].split(maxsplit=1)
     assert int(count) > 20
-    assert missing.strip() == "[]"
+    assert missing == "[]"
+
+
+@pytest.mark.slow
+def test_a_training_does_not_import_the_compiler_of_torch(told):
+    """It takes as long to import as torch."""
+    assert told[1] == "[]"
 
 
 class Started(list):

@@ -17,6 +17,7 @@ from lexsplat.codebook.losses import quantization_loss
 from lexsplat.codebook.settings import CodebookConfig
 from lexsplat.codebook.space import BLOCK_ROWS, Codebook
 from lexsplat.runtime import memory as budget
+from lexsplat.runtime.adam import AdamW
 from lexsplat.runtime.device import one_thread
 from lexsplat.runtime.errors import TrainingError
 from lexsplat.runtime.progress import Event, Listener, silent
@@ -293,7 +294,7 @@ def refine(
     parameters = [
         part.detach().clone().requires_grad_() for part in (code_clip, code_dino) if part is not None
     ]
-    optimizer = torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
+    optimizer = AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
     for step in range(config.steps):
         rows = torch.randint(len(clip), (min(config.batch_size, len(clip)),), generator=generator)
         rows = rows.to(clip.device)

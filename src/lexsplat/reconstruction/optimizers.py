@@ -7,6 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from lexsplat.runtime.adam import Adam
+
 
 def adam(parameter: torch.nn.Parameter, rate: float) -> torch.optim.Adam:
     """Adam with the epsilon of 3DGS, fused: one pass over memory, the same bits at any number of threads.
@@ -18,7 +20,7 @@ def adam(parameter: torch.nn.Parameter, rate: float) -> torch.optim.Adam:
         parameter: The parameter to optimize, float32.
         rate: Learning rate.
     """
-    return torch.optim.Adam([parameter], lr=rate, eps=1e-15, fused=True)
+    return Adam([parameter], lr=rate, eps=1e-15, fused=True)
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:

@@ -1,6 +1,4 @@
-"""Runs hostile readers in a separate process::
-
-    python -m support.hostile.running WORK_FOLDER REPORT.json CLAIMS_FOLDER
+"""Runs hostile readers in a process of its own; its arguments are WORK_FOLDER REPORT.json CLAIMS_FOLDER.
 
 Several processes share the readers: each takes the next one that no other has claimed. Once everything is imported
 and a reader has read its valid input, the process may take one more gigabyte of memory (RLIMIT_DATA), and each input
@@ -185,7 +183,3 @@ def main() -> None:
 def _peak() -> int:
     """Largest memory of this process in bytes. (Linux hands ``ru_maxrss`` on from the process that started it.)"""
     return int(re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())[1]) * 1024
-
-
-if __name__ == "__main__":
-    main()

@@ -21,6 +21,7 @@ from lexsplat.evaluation.baselines.feature_rendering import (
     back_projected_mean,
     resized_map,
 )
+from lexsplat.runtime.adam import Adam
 from lexsplat.runtime.progress import Event
 
 
@@ -65,7 +66,7 @@ class Dff:
         done = len(views.names)
         for columns in ranges:
             part = features[:, columns].clone().requires_grad_()
-            optimizer = torch.optim.Adam([part], lr=config.learning_rate)
+            optimizer = Adam([part], lr=config.learning_rate)
             for step, name in enumerate(views.order(config.steps, generator)):
                 for group in optimizer.param_groups:
                     group["lr"] = config.learning_rate * 0.1 ** (step / config.steps)

@@ -33,6 +33,7 @@ from lexsplat.evaluation.baselines.feature_rendering import (
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.relevancy import QueryConfig, Question
+from lexsplat.runtime.adam import Adam
 from lexsplat.runtime.progress import Event
 
 
@@ -211,7 +212,7 @@ class Ovs3d:
             listener=lambda done: run.listener(Event("3dovs", done, total)),
         )
         fit = _Fit(data, views, start, classes.to(start.device), config)
-        optimizer = torch.optim.Adam([fit.features, fit.choices], lr=config.learning_rate)
+        optimizer = Adam([fit.features, fit.choices], lr=config.learning_rate)
         generator = torch.Generator().manual_seed(run.seed)
         for step, name in enumerate(views.order(config.steps, generator), start=1):
             loss = fit.loss(name, generator)

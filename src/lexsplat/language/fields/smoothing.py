@@ -76,12 +76,19 @@ def scene_box(means: Tensor) -> tuple[Tensor, Tensor]:
     return ends.mean(0), extent
 
 
+class _EmptyLinear(nn.Linear):
+    """A layer whose numbers are not initialized; `nn.utils.skip_init` would import sympy."""
+
+    def reset_parameters(self) -> None:
+        pass
+
+
 def mlp(widths: tuple[int, ...], generator: torch.Generator | None) -> nn.Sequential:
     """Linear layers with ReLU between them, initialized as nn.Linear is, but by the given generator."""
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     layers: list[nn.Module] = []
     for inputs, outputs in itertools.pairwise(widths):
-        linear = nn.utils.skip_init(nn.Linear, inputs, outputs)
+        linear = _EmptyLinear(inputs, outputs)
         bound = 1 / math.sqrt(inputs)
         with torch.no_grad():
             linear.weight.uniform_(-bound, bound, generator=generator)

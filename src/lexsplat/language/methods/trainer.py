@@ -25,6 +25,7 @@ from lexsplat.language.losses import (
 from lexsplat.language.methods.trained_settings import TrainedConfig
 from lexsplat.reconstruction.optimizers import below_prefix, check_moments, with_prefix
 from lexsplat.rendering import PreparedView
+from lexsplat.runtime.adam import AdamW
 from lexsplat.runtime.errors import TrainingError
 
 
@@ -78,7 +79,7 @@ class FieldTrainer:
             for parameters, rate, decay in rates
         ]
         # AdamW without weight decay is Adam, the paper's optimizer.
-        return torch.optim.AdamW(groups, betas=(0.9, 0.999))
+        return AdamW(groups, betas=(0.9, 0.999))
 
     def step(
         self, camera: Camera, code_map: NDArray[np.integer] | Tensor, *, prepared: PreparedView | None = None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,14 +48,30 @@ TURNS = sum(count for _, count in _TILTS)
 """Cameras at each place within the scene."""
 
 Points = NDArray[np.float64]
+T = TypeVar("T")
+Looking = tuple[Points, Target]
 
 
-def around(surroundings: Surroundings, size: tuple[int, int]) -> list[tuple[Camera, Target]]:
+def some(items: list[T], most: int, generator: np.random.Generator) -> list[T]:
+    """All items, or as many of them in their order as may be."""
+    if len(items) <= most:
+        return items
+    return [items[index] for index in np.sort(generator.choice(len(items), most, replace=False))]
+
+
+def around(
+    surroundings: Surroundings, size: tuple[int, int], choose: Callable[[list[Looking]], list[Looking]] = list
+) -> list[tuple[Camera, Target]]:
     """Cameras on circles around the scene and its parts that see their targets from free, sensible places.
 
     A camera is above the ground, on the inner side of a wall it looks at, and not close to anything.
+
+    Args:
+        surroundings: The scene.
+        size: Width and height of the cameras in pixels.
+        choose: Takes some of the positions with their targets; to make a camera takes longer than to find its place.
     """
-    found = []
+    found: list[Looking] = []
     up, whole = surroundings.up.direction, surroundings.whole
     least = _CLOSEST * whole.radius / math.sin(FOV_Y / 2)
     for target in (whole, *surroundings.targets):
@@ -66,8 +84,10 @@ def around(surroundings: Surroundings, size: tuple[int, int]) -> list[tuple[Came
             behind = target.normal is not None and away @ target.normal < 0.1 * distance
             under = position @ up < surroundings.ground + 0.05 * surroundings.height
             if not (behind or under or room < _CLEARANCE * distance):
-                found.append((look_at(position, target.center, up, *size, FOV_Y), target))
-    return found
+                found.append((position, target))
+    return [
+        (look_at(position, target.center, up, *size, FOV_Y), target) for position, target in choose(found)
+    ]
 
 
 def above(whole: Target, up: Points, size: tuple[int, int]) -> list[Camera]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.pipeline.viewpoints.candidates import FOV_Y, around, inside
+from lexsplat.pipeline.viewpoints.candidates import FOV_Y, around, inside, some
 from lexsplat.pipeline.viewpoints.interior import (
     Interior,
     Looks,
@@ -239,11 +240,9 @@ def _good_candidates(
     gaussians: Gaussians, found: Surroundings, side: Side, seed: int, listener: Listener, photo: Photo | None
 ) -> _Tried:
     generator = np.random.default_rng(seed)
-    seen_from = around(found, SMALL) if photo is None else photo.candidates(found, SMALL)
+    choose = partial(some, most=_MOST_CANDIDATES, generator=generator)
+    seen_from = around(found, SMALL, choose) if photo is None else choose(photo.candidates(found, SMALL))
     outer: list[tuple[Camera, Target | None]] = list(seen_from)
-    if len(outer) > _MOST_CANDIDATES:
-        kept = np.sort(generator.choice(len(outer), _MOST_CANDIDATES, replace=False))
-        outer = [outer[index] for index in kept]
     inner = inside(without_lonely_points(found), SMALL)
     candidates = [*outer, *((camera, None) for camera in inner)]
     qualities, depths = np.zeros(len(candidates), np.float32), []

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from scipy.spatial import cKDTree
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.rotations import matrices_from_quaternions
-from lexsplat.pipeline.viewpoints.candidates import around
+from lexsplat.pipeline.viewpoints.candidates import around, some
 from lexsplat.pipeline.viewpoints.looking import SMALL, draw_depth, look_from_above
 from lexsplat.pipeline.viewpoints.surroundings import Surroundings, find_surroundings
 from lexsplat.pipeline.viewpoints.upward import UpwardDirections
@@ -164,11 +165,7 @@ def _select(gaussians: Gaussians, indices: NDArray[np.int64]) -> Gaussians:
 
 def _cameras(found: Surroundings, generator: np.random.Generator) -> list[Camera]:
     """Views around a scene."""
-    cameras = [camera for camera, _ in around(found, SMALL)]
-    if len(cameras) > _VIEWS:
-        chosen = generator.choice(len(cameras), _VIEWS, replace=False)
-        cameras = [cameras[index] for index in np.sort(chosen)]
-    return cameras
+    return [camera for camera, _ in around(found, SMALL, partial(some, most=_VIEWS, generator=generator))]
 
 
 def _spread(gaussians: Gaussians) -> NDArray[np.float64]:

@@ -55,6 +55,7 @@ def standing_shares(pieces: Pieces, directions: Points) -> Points:
     if inner.sum() < _FEWEST_OF_A_THING:
         return np.zeros(len(directions))
     pairs = cKDTree(points).query_pairs(link, output_type="ndarray")
+    pairs = pairs[np.lexsort(pairs.T[::-1])]  # once, instead of in each graph
     things = _linked(pairs, inner)
     sizes = np.bincount(things[inner])
     ends, which = np.unique(np.concatenate([directions, -directions]) + 0.0, axis=0, return_inverse=True)
@@ -79,9 +80,11 @@ def standing_shares(pieces: Pieces, directions: Points) -> Points:
 
 
 def _linked(pairs: NDArray[np.int64], members: Mask) -> NDArray[np.int64]:
-    """Number of the thing that each member is part of ``[M]``, by pairs of near points ``[P, 2]``; 0 for others."""
+    """Number of the thing that each member is part of ``[M]``, by sorted pairs of near points ``[P, 2]``; 0 for
+    others.
+    """
     count, numbers = int(members.sum()), np.cumsum(members) - 1
-    linked = numbers[pairs[members[pairs].all(1)]]
+    linked = numbers[pairs[members[pairs[:, 0]] & members[pairs[:, 1]]]]
     graph = coo_array((np.ones(len(linked), bool), linked.T), shape=(count, count))
     labels = np.zeros(len(members), np.int64)
     labels[members] = connected_components(graph, directed=False)[1]

@@ -158,5 +158,6 @@ def ground_share(pieces: Pieces, up: Points) -> float:
     footprint = pieces.points @ np.stack(upright_frame(up)[:2]).T
     first, last = np.quantile(footprint, [0.02, 0.98], axis=0)
     cells = np.floor((footprint - first) / max(float((last - first).max()) / _GROUND_CELLS, 1e-300))
+    numbers = np.ascontiguousarray(cells).view(np.complex128)[:, 0]  # sorted ten times as fast as rows
     ground = level & (np.abs(heights - middle) < half)
-    return len(np.unique(cells[ground], axis=0)) / len(np.unique(cells, axis=0))
+    return len(np.unique(numbers[ground])) / len(np.unique(numbers))
