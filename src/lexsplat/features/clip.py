@@ -77,6 +77,13 @@ class ClipEncoder(PretrainedModel):
             )
 
     def _own_model(self, folder: Path) -> Any:
+        self._texts = None
+        try:  # the settings, which the light tower does not read
+            for path in tokenizer_files(folder)[1:]:
+                if path.suffix == ".json":
+                    read_config(path, "a tokenizer")
+        except ModelError:
+            return None
         weights = functools.cache(lambda: load_weights(folder, self.name))
         self._texts = light_tower(folder, weights, self.device)
         if self._texts is None:
