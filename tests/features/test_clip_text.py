@@ -8,7 +8,7 @@ import weakref
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from support.encoder_folders import in_open_clip_names, save_model, seeded
+from support.encoder_folders import in_open_clip_names, save_model, seeded, unit
 
 from lexsplat.features.clip_text import ClipText, open_clip_text
 from lexsplat.features.encoders import load_clip
@@ -28,11 +28,22 @@ TEXTS = [
 ]
 
 
-def assert_same_embeddings(folder) -> None:
+def assert_same_embeddings(folder, model=None) -> None:
+    """Assert that both encoders of a folder give the embeddings of transformers' model of it."""
+    from transformers import AutoTokenizer, CLIPModel
+
     light, whole = load_text(str(folder)), load_clip(str(folder))
     assert isinstance(light, ClipText)
-    expected = torch.cat([whole.encode_text([text]) for text in TEXTS])
-    torch.testing.assert_close(light.encode_text(TEXTS), expected, atol=1e-6, rtol=0)
+    model = model or CLIPModel.from_pretrained(folder)
+    tokenizer, limit = AutoTokenizer.from_pretrained(folder), model.config.text_config.max_position_embeddings
+    rows = []
+    for text in TEXTS:
+        tokens = tokenizer(text, truncation=True, max_length=limit, return_tensors="pt")
+        with torch.no_grad():
+            rows.append(model.text_projection(model.text_model(**tokens).pooler_output))
+    found = light.encode_text(TEXTS)
+    torch.testing.assert_close(found, unit(torch.cat(rows)), atol=1e-6, rtol=0)
+    assert torch.equal(whole.encode_text(TEXTS), found)
     assert light.content_hash == whole.content_hash
 
 
@@ -83,9 +94,10 @@ def test_the_light_tower_reads_the_names_of_open_clip_and_half_precision(clip_fo
 
     copy = shutil.copytree(clip_folder, tmp_path / "copy")
     (copy / "model.safetensors").unlink()
-    foreign = in_open_clip_names(CLIPModel.from_pretrained(clip_folder))
+    model = CLIPModel.from_pretrained(clip_folder)
+    foreign = in_open_clip_names(model)
     save_file({name: value.half() for name, value in foreign.items()}, copy / "open_clip_model.safetensors")
-    assert_same_embeddings(copy)
+    assert_same_embeddings(copy, model.half().float())
 
 
 @pytest.mark.slow

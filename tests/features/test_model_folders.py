@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 import os
@@ -11,7 +12,14 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from support.encoder_folders import in_open_clip_names, in_timm_names, save_model, seeded, tiny_vit
+from support.encoder_folders import (
+    in_open_clip_names,
+    in_timm_names,
+    revert_names,
+    save_model,
+    seeded,
+    tiny_vit,
+)
 from support.refusals import assert_reports
 from support.siglip_folder import siglip_folder
 
@@ -43,13 +51,14 @@ def assert_same_model(found, folder: Path) -> None:
     from transformers import AutoModel
 
     model = AutoModel.from_pretrained(folder)
-    expected, state = dict(model.state_dict()), dict(found._model.state_dict())
-    if (
-        getattr(found, "_images", None) is not None
-    ):  # the tensors of its image tower, as lexsplat arranges them
-        expected = {name: value for name, value in expected.items() if not name.startswith("vision_model")}
+    if getattr(found, "_images", None) is None:
+        own = not isinstance(found._model, type(model))
+        expected, state = revert_names(model) if own else model.state_dict(), found._model.state_dict()
+    else:  # both towers as lexsplat arranges them
+        names = {name: name.removeprefix("text_model.") for name in model.state_dict() if "text_" in name}
+        expected = {names[name]: value for name, value in model.state_dict().items() if name in names}
         expected |= tensors_of(ClipImages(model))
-        state |= tensors_of(found._images)
+        state = found.text_tower().tensors | tensors_of(found._images)
     assert {name for name in expected if "pooler" not in name} <= set(state)
     for name, tensor in state.items():
         if "pooler" not in name:
@@ -62,6 +71,8 @@ def tensors_of(value, name: str = "images") -> dict[str, torch.Tensor]:
         return {name: value}
     if isinstance(value, torch.nn.Module):
         return {f"{name}.{key}": tensor for key, tensor in value.state_dict().items()}
+    if isinstance(value, functools.partial):
+        value = list(value.keywords.values())
     parts = dict(enumerate(value)) if isinstance(value, list) else getattr(value, "__dict__", {})
     return {
         key: tensor

@@ -12,7 +12,7 @@ from lexsplat.scenes.library import Library
 
 LIBRARIES = {
     "PIL", "gsplat", "huggingface_hub", "jinja2", "numba", "numpy", "pycolmap", "rich", "safetensors", "scipy",
-    "simplemma", "skimage", "sklearn", "starlette", "tokenizers", "torch", "transformers", "tyro", "uvicorn",
+    "simplemma", "skimage", "sklearn", "starlette", "sympy", "tokenizers", "torch", "transformers", "tyro", "uvicorn",
 }  # fmt: skip
 """Everything that takes more than a few milliseconds to import; a command may load what its row lists."""
 HELP = {"rich", "tyro"}
@@ -73,6 +73,11 @@ try:
 except SystemExit:
     pass
 """
+LOAD = """
+from lexsplat.features.encoders import load_clip, load_dino
+load_clip("bundled").encode_text(["apple"])
+load_dino("bundled")
+"""
 IMPORT, OPEN = "import lexsplat", "import lexsplat; lexsplat.open_scene('demo', device='cpu')"
 
 EXPECTED: dict[tuple[str, ...], tuple[str, set[str]]] = {
@@ -80,6 +85,7 @@ EXPECTED: dict[tuple[str, ...], tuple[str, set[str]]] = {
     **{words: (COMMAND, libraries) for words, libraries in ALLOWED.items()},
     (IMPORT,): (IMPORT, set()),
     (OPEN,): (OPEN, ANSWER),
+    (LOAD,): (LOAD, {"numpy", "safetensors", "tokenizers", "torch"}),
 }
 """Programs, their code, and the libraries that they may load."""
 
@@ -149,3 +155,8 @@ def test_importing_lexsplat_loads_no_library(surplus):
 @pytest.mark.slow
 def test_opening_a_scene_loads_no_structure_from_motion_and_no_transformers(surplus):
     assert surplus(OPEN) == set()
+
+
+@pytest.mark.slow
+def test_loading_the_bundled_encoders_loads_neither_transformers_nor_the_compiler_of_torch(surplus):
+    assert surplus(LOAD) == set()

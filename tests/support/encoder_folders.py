@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lexsplat.features.encoders import load_clip
+from lexsplat.features.hub import model_folder
 
 MEAN, STD = [0.1, 0.2, 0.3], [0.5, 0.6, 0.7]
 
@@ -42,9 +42,9 @@ def save_model(model, folder: Path) -> Path:
 
 def write_clip(folder: Path, width: int = 20) -> Path:
     """A tiny CLIP with random weights, embeddings of a width and the bundled tokenizer."""
-    from transformers import CLIPConfig, CLIPModel
+    from transformers import AutoTokenizer, CLIPConfig, CLIPModel
 
-    tokenizer = load_clip("bundled")._tokenizer
+    tokenizer = AutoTokenizer.from_pretrained(model_folder("bundled", "clip"))
     config = CLIPConfig(
         text_config={
             "vocab_size": len(tokenizer), "hidden_size": 24, "intermediate_size": 40, "num_hidden_layers": 2,

@@ -25,7 +25,8 @@ from lexsplat.features.clip_text import (
 from lexsplat.features.hub import local_folder, tokenizer_files
 from lexsplat.features.portable import TextWeights, tokenizer_content
 from lexsplat.features.pretrained import PretrainedModel, check_images, normalization, resize_images
-from lexsplat.features.weights import read_config
+from lexsplat.features.towers import clip_images
+from lexsplat.features.weights import load_weights, read_config
 from lexsplat.runtime.errors import ModelError
 
 DEFAULT_CLIP = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
@@ -41,27 +42,31 @@ _WITHOUT_PATCHES = "use image-level embeddings only: `--features.crop-tokens cla
 
 
 class ClipEncoder(PretrainedModel):
-    """A CLIP-like model of transformers: CLIP, SigLIP, SigLIP 2, and others with both ``get_*_features``."""
+    """A CLIP-like model: CLIP, SigLIP, SigLIP 2, and others of transformers with both ``get_*_features``.
+
+    CLIP's own architecture is computed here, without transformers.
+    """
 
     tower = "clip"
 
     def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
         super().__init__(folder, name, device)
-        self._folder = folder
         config = self._model.config
-        if not (hasattr(self._model, "get_image_features") and hasattr(config, "vision_config")):
+        both = hasattr(self._model, "get_image_features") and hasattr(config, "vision_config")
+        if self._texts is None and not both:
             raise self._refusal(
                 "a CLIP-like model with an image and a text tower", f"try {DEFAULT_CLIP} or `--clip bundled`"
             )
         self._siglip = config.model_type.startswith("siglip")
         self.image_size = _image_size(config.vision_config)
-        self._text_length = int(config.text_config.max_position_embeddings)
         default = (_HALF, _HALF) if self._siglip else (_CLIP_MEAN, _CLIP_STD)
         self._mean, self._std = normalization(folder, default, self.device)
         self._images = None
         if config.model_type == "clip":
             self._images, self._model.vision_model = ClipImages(self._model), None
-        self._tokenizer = _load_tokenizer(folder, name, config)
+        if self._texts is None:
+            self._text_length = int(config.text_config.max_position_embeddings)
+            self._tokenizer = _load_tokenizer(folder, name, config)
         words = self.encode_text(UNLIKE_WORDS)
         self.dim = int(words.shape[-1])
         if F.pdist(words).min() < UNLIKE:
@@ -70,6 +75,21 @@ class ClipEncoder(PretrainedModel):
                 "fetch the whole model again, or choose another model",
                 f"the same embedding for {', '.join(UNLIKE_WORDS[:3])} ...",
             )
+
+    def _own_model(self, folder: Path) -> Any:
+        self._texts = None
+        try:  # the settings, which the light tower does not read
+            for path in tokenizer_files(folder)[1:]:
+                if path.suffix == ".json":
+                    read_config(path, "a tokenizer")
+        except ModelError:
+            return None
+        weights = functools.cache(lambda: load_weights(folder, self.name))
+        self._texts = light_tower(folder, weights, self.device)
+        if self._texts is None:
+            return None
+        self._texts.content_hash = self.content_hash
+        return clip_images(read_config(folder / "config.json", "a model configuration"), weights())
 
     @torch.inference_mode()
     def encode_images(self, images: Tensor) -> Tensor:
@@ -120,11 +140,16 @@ class ClipEncoder(PretrainedModel):
         """
         if not prompts or any(not prompt.strip() for prompt in prompts):
             raise ValueError("prompts must be one or more texts that are not empty")
-        batches = [
-            list(prompts[start : start + _TEXT_BATCH]) for start in range(0, len(prompts), _TEXT_BATCH)
-        ]
-        features = [_pooled(self._model.get_text_features(**self._text_inputs(batch))) for batch in batches]
-        found = F.normalize(torch.cat(features).float(), dim=-1).cpu()
+        if self._texts is not None:
+            found = self._texts.encode_text(prompts)
+        else:
+            batches = [
+                list(prompts[start : start + _TEXT_BATCH]) for start in range(0, len(prompts), _TEXT_BATCH)
+            ]
+            features = [
+                _pooled(self._model.get_text_features(**self._text_inputs(batch))) for batch in batches
+            ]
+            found = F.normalize(torch.cat(features).float(), dim=-1).cpu()
         if not bool(found.isfinite().all()):
             raise self._refusal("finite text embeddings", "choose another model", "NaN or infinity")
         return found
@@ -134,15 +159,15 @@ class ClipEncoder(PretrainedModel):
 
         Of other architectures than CLIP's own it is this encoder, which gives its image tower away.
         """
-        light = light_tower(self._folder, self._model.state_dict, device)
-        if light is None:
+        if self._texts is None:
             self._model.vision_model = self._images = None
             return self
-        light.content_hash = self.content_hash
-        return light
+        return self._texts.on(device)
 
     def text_tower(self) -> TextWeights | None:
         """The text tower for other programs; None if it is neither of CLIP's nor of SigLIP's architecture."""
+        if self._texts is not None:
+            return self._texts.text_tower()
         config = self._model.config.text_config
         kind = self._model.config.model_type
         tokenizer = tokenizer_content(self._tokenizer)
@@ -183,6 +208,8 @@ class ClipEncoder(PretrainedModel):
 
     def tokens_over(self, prompt: str) -> int:
         """Number of tokens by which a prompt exceeds the limit of the model and is truncated."""
+        if self._texts is not None:
+            return self._texts.tokens_over(prompt)
         return max(len(self._tokenizer(prompt, verbose=False)["input_ids"]) - self._text_length, 0)
 
     def _pixels(self, images: Tensor) -> Tensor:

@@ -65,7 +65,7 @@ class ClipImages:
     2022): the value vector of the last attention layer, projected like the class token.
 
     Args:
-        model: A ``CLIPModel`` of transformers. Its image tower is not needed afterwards.
+        model: A ``CLIPModel`` of transformers, or `clip_images`. Its image tower is not needed afterwards.
     """
 
     def __init__(self, model: Any) -> None:

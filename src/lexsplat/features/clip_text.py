@@ -11,6 +11,7 @@ import json
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +21,11 @@ from torch import Tensor
 
 from lexsplat.features.hub import content_hash
 from lexsplat.features.portable import TextWeights
+from lexsplat.features.towers import ACTIVATIONS, settings_of
 from lexsplat.features.weights import load_weights, read_config
 
 log = logging.getLogger("lexsplat")
 
-_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "quick_gelu": lambda hidden: hidden * torch.sigmoid(1.702 * hidden),
-    "gelu": F.gelu,
-}
 _DEFAULTS = {  # of transformers' CLIPTextConfig, which files may leave out
     "vocab_size": 49408, "hidden_size": 512, "intermediate_size": 2048, "num_hidden_layers": 12,
     "num_attention_heads": 8, "max_position_embeddings": 77, "hidden_act": "quick_gelu", "layer_norm_eps": 1e-5,
@@ -35,7 +33,6 @@ _DEFAULTS = {  # of transformers' CLIPTextConfig, which files may leave out
 }  # fmt: skip
 _LEGACY_END = 2
 """An end token of this number stands for the largest number in the prompt, as in OpenAI's code."""
-_MOST_LAYERS = 1000
 _TOGETHER = 64
 """Prompts in one pass of `ClipText.encode_together`, at most."""
 UNLIKE = 1e-5
@@ -71,16 +68,15 @@ def light_tower(
     if not (folder / "tokenizer.json").is_file():
         return None
     config = read_config(folder / "config.json", "a model configuration")
-    given = config.get("text_config") or config.get("text_config_dict") or {}
-    if config.get("model_type") != "clip" or not isinstance(given, dict):
+    settings = settings_of(config.get("text_config") or config.get("text_config_dict") or {}, _DEFAULTS)
+    if settings is None or config.get("model_type") != "clip":
         return None
-    settings = {**_DEFAULTS, **{key: given[key] for key in _DEFAULTS if given.get(key) is not None}}
     weights = {
         key: value
         for key, value in load().items()
         if key.startswith(("text_model.", "text_projection.")) and not key.endswith("position_ids")
     }
-    if not _is_usable(settings) or _shapes(settings, config.get("projection_dim", 512)) != {
+    if _shapes(settings, config.get("projection_dim", 512)) != {
         key: tuple(value.shape) for key, value in weights.items()
     }:
         return None
@@ -90,17 +86,6 @@ def light_tower(
     tower = ClipText(settings, weights, tokenizer, device)
     words = tower.encode_text(UNLIKE_WORDS)
     return tower if bool(words.isfinite().all()) and F.pdist(words).min() >= UNLIKE else None
-
-
-def _is_usable(settings: Mapping[str, Any]) -> bool:
-    sizes = [value for key, value in settings.items() if key not in ("hidden_act", "layer_norm_eps")]
-    return (
-        all(isinstance(size, int) and 0 < size < 1 << 20 for size in sizes)
-        and isinstance(settings["layer_norm_eps"], float)
-        and settings["num_hidden_layers"] <= _MOST_LAYERS
-        and settings["hidden_size"] % settings["num_attention_heads"] == 0
-        and settings["hidden_act"] in _ACTIVATIONS
-    )
 
 
 def _tokenizer(path: Path, size: int) -> Any:
@@ -170,7 +155,7 @@ class ClipText:
         self._epsilon, self._end = settings["layer_norm_eps"], settings["eos_token_id"]
         self._limit = settings["max_position_embeddings"]
         self._activation_name = settings["hidden_act"]
-        self._activation = _ACTIVATIONS[self._activation_name]
+        self._activation = ACTIVATIONS[self._activation_name]
         # Copies, because tensors in a file are not aligned, and alignment affects the rounding of sums.
         self._weights = {
             re.sub(r"^text_model\.", "", name): value.to(self.device, torch.float32, copy=True)
@@ -235,6 +220,13 @@ class ClipText:
     def _place_of_end(self, ids: Tensor) -> int:
         """Place of the end token among the tokens ``[T]`` of a prompt."""
         return int((ids if self._end == _LEGACY_END else (ids == self._end).int()).argmax())
+
+    def on(self, device: torch.device | str) -> ClipText:
+        """The same tower on a device."""
+        tower = copy(self)
+        tower.device = torch.device(device)
+        tower._weights = {name: value.to(tower.device) for name, value in self._weights.items()}
+        return tower
 
     def tokens_over(self, prompt: str) -> int:
         """Number of tokens by which a prompt exceeds the positions of the model and is truncated."""

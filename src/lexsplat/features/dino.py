@@ -13,6 +13,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lexsplat.features.pretrained import IMAGENET, PretrainedModel, check_images, normalization, resize_images
+from lexsplat.features.towers import vision_transformer
+from lexsplat.features.weights import load_weights, read_config
 
 DEFAULT_DINO = "facebook/dino-vits8"
 """The DINO of the paper's released code."""
@@ -45,6 +47,12 @@ class DinoEncoder(PretrainedModel):
         # Models that do not take this option interpolate always, or use rotary positions.
         taken = inspect.signature(self._model.forward).parameters
         self._options = {name: True for name in ("interpolate_pos_encoding",) if name in taken}
+
+    def _own_model(self, folder: Path) -> Any:
+        config = read_config(folder / "config.json", "a model configuration")
+        if config.get("model_type") != "vit":
+            return None
+        return vision_transformer(config, load_weights(folder, self.name))
 
     @torch.inference_mode()
     def encode_dense(

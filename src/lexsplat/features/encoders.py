@@ -1,7 +1,7 @@
 """Encoders: images and texts to one space (CLIP, SigLIP), and images to dense features (DINO, DINOv2, DINOv3).
 
-transformers builds them from a folder or a name. Every size (image, text length, projection, patch) is read from the
-model's configuration.
+CLIP's own architecture and DINO's are computed by lexsplat, others by transformers. Every size (image, text length,
+projection, patch) is read from the model's configuration.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Shared by the encoders: loading a transformers model from a folder, its precision, and preprocessing of images.
+"""Shared by the encoders: loading a model from a folder, its precision, and preprocessing of images.
 
 Resizing and normalization are done in torch, without an image library.
 """
@@ -35,7 +35,7 @@ _CLEARLY = 0.8
 
 
 class PretrainedModel:
-    """A pretrained vision model of transformers, frozen.
+    """A pretrained vision model, frozen: of `lexsplat.features.towers`, or of transformers.
 
     Args:
         folder: Local model folder.
@@ -43,7 +43,7 @@ class PretrainedModel:
         device: Device of the model.
 
     Raises:
-        ModelError: If transformers cannot load the folder, or a weight is missing.
+        ModelError: If neither can load the folder, or a weight is missing.
     """
 
     tower: ClassVar[str]
@@ -54,10 +54,16 @@ class PretrainedModel:
     def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
         self.name, self.device = name, torch.device(device)
         self.content_hash = content_hash(folder, self.tower)
-        with _quiet_transformers():
-            model = build_model(folder, name, self._spare)
+        model = self._own_model(folder)
+        if model is None:
+            with _quiet_transformers():
+                model = build_model(folder, name, self._spare)
         self._model = model.eval().requires_grad_(False).to(self.device)
         self._full_precision = False
+
+    def _own_model(self, folder: Path) -> Any:
+        """The model without transformers; None if `lexsplat.features.towers` does not have it."""
+        return None
 
     def _refusal(self, expected: str, remedy: str, found: str = "") -> ModelError:
         """The error for a model of another architecture, or with other outputs."""
