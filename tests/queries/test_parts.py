@@ -72,7 +72,7 @@ def mug():
     rng = np.random.default_rng(0)
     angle, height = rng.uniform(0, 2 * np.pi, 2500), rng.uniform(-1, 1, 2500)
     body = np.stack([np.cos(angle), np.sin(angle), height], 1)
-    along, around = rng.uniform(-np.pi / 2, np.pi / 2, 400), rng.uniform(0, 2 * np.pi, 400)
+    along, around = rng.uniform(-np.pi / 2, np.pi / 2, 800), rng.uniform(0, 2 * np.pi, 800)
     wide = 0.6 + 0.1 * np.cos(around)
     handle = np.stack([1.02 + wide * np.cos(along), 0.1 * np.sin(around), wide * np.sin(along)], 1)
     near = np.concatenate([np.full(2500, -1.0), 1 - np.abs(along) / (np.pi / 2)])
@@ -81,14 +81,15 @@ def mug():
 
 def test_a_part_grows_from_its_best_scores_to_where_it_meets_its_thing(monkeypatch):
     gaussians, near = mug()
-    scores = np.array([0.2, 0.6, 0.9])[(near >= 0).astype(int) + (near > 0.6)]
-    scores += np.random.default_rng(1).normal(0, 0.02, len(near))
+    scores = np.where(near >= 0, 0.55 + 0.35 * near, 0.2) + np.random.default_rng(1).normal(
+        0, 0.05, len(near)
+    )
     own, thing = torch.from_numpy(scores).float(), torch.ones(len(near), dtype=torch.bool)
 
     def found() -> np.ndarray:
         return (part_scores(own, thing, gaussians, thing.float()) >= SEGMENT_THRESHOLD).numpy()
 
-    assert share(found(), near >= 0) > 0.9
+    assert share(found(), near >= 0) > 0.8
     monkeypatch.setattr(parts, "NEAREST", 1.0)
     assert share(found(), near >= 0) < 0.6, "without growing it is the middle alone"
 
@@ -100,6 +101,13 @@ def test_a_part_does_not_grow_where_nothing_stops_it():
     own, thing = torch.from_numpy(scores).float(), torch.from_numpy(places != TABLE)
     grown = (part_scores(own, thing, gaussians, torch.ones(len(places))) >= SEGMENT_THRESHOLD).numpy()
     assert (grown & (head < 0.6)).sum() == 0, "around the top of a ball each wider border is longer"
+
+
+def test_a_part_with_a_border_of_its_own_does_not_grow_to_another_one():
+    gaussians, places = bear()
+    own = torch.from_numpy(np.array([0.1, 0.2, 0.5, 0.9, 0.1])[places]).float()
+    found = part_scores(own, torch.from_numpy(places != TABLE), gaussians, torch.ones(len(places)))
+    assert share((found >= SEGMENT_THRESHOLD).numpy(), places == NOSE) > 0.9, "not the muzzle"
 
 
 def test_a_pixel_that_shows_a_part_for_the_most_part_shows_it():

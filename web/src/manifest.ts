@@ -119,6 +119,8 @@ export interface PartRule {
   /** Steps of the random walks, and the least share of them that end in the part where it may grow. */
   walked: number;
   nearest: number;
+  /** A border that links of this total weight cross is short enough. */
+  short: number;
   /** Scores in a part start at this share of the way from the border to 1. */
   firm: number;
   outside: number;
@@ -256,7 +258,7 @@ const FIELDS: [string, string, (value: unknown) => boolean][] = [
 const SEGMENT_RULE = ["lowest", "border", "own_share", "steepness", "most_certain", "below", "threshold"];
 const PART_RULE = [
   "held", "fewest", "neighbors", "color", "score", "rounds", "shared", "best", "lowest", "mostly", "all", "usual", "spread", "first",
-  "last", "steps", "near", "few", "walked", "nearest", "firm", "outside",
+  "last", "steps", "near", "few", "walked", "nearest", "short", "firm", "outside",
 ];
 const SELECTION_RULE = [
   "threshold", "link", "smallest_share", "convincing", "peak_count", "faint", "same_surface", "least_surface",

@@ -86,7 +86,7 @@ function grown(smooth: Float64Array, base: number, border: number, links: Link[]
   let [size, fewest, crossing] = [0, Infinity, 0];
   order.forEach((n, place) => {
     crossing += change[place];
-    if (place + 1 >= count && reached[n] >= rule.nearest && crossing < fewest) [size, fewest] = [place + 1, crossing];
+    if (place + 1 >= count && reached[n] >= rule.nearest && Math.max(crossing, rule.short) < fewest) [size, fewest] = [place + 1, Math.max(crossing, rule.short)];
   });
   return isPart.map((is, n) => is || rank[n] < size);
 }

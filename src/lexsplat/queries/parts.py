@@ -52,6 +52,8 @@ NEAR, FEW = 0.05, 0.1
 """Reach of what counts as near a border, on the same scale, and the share of the part that is few in any case."""
 WALKED, NEAREST = 50, 0.2
 """Steps of the random walks, and the least share of them that end in the part where it may grow."""
+SHORT = 1.0
+"""A border that links of this total weight cross is short enough: a nose in black does not grow to the muzzle."""
 FIRM = 0.5
 """Scores in a part start at this share of the way from the border to 1. Pixels blend them with those beside it: with
 scores at the border, a pixel would have to show the part alone."""
@@ -149,7 +151,7 @@ def _grown(smooth: FloatArray, base: float, border: float, links: csr_array) -> 
     first, last = rank[links.indices], np.repeat(rank, np.diff(links.indptr))
     crosses, count = first < last, len(order) + 1
     starts, ends = (np.bincount(end[crosses], links.data[crosses], count) for end in (first, last))
-    crossing = np.cumsum(starts - ends)  # [n]: of the first n + 1
+    crossing = np.maximum(np.cumsum(starts - ends), SHORT)  # [n]: of the first n + 1
     fewest, most = int(part.sum()), int((reached >= NEAREST).sum())
     return part | (rank < fewest + crossing[fewest - 1 : most].argmin()) if fewest else part
 
