@@ -20,7 +20,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -170,10 +170,10 @@ def make_web_like(folder: Path, seed: int = 0, facts: Facts = Facts(), private: 
         raise TypeError("the bundled encoder is a ClipEncoder")
     phrases = general_phrases(held_out=False)
     source = Path(model_folder("bundled", "clip"))
-    from transformers import CLIPModel  # takes seconds, and tests import this module
+    from transformers import AutoTokenizer, CLIPModel  # takes seconds, and tests import this module
 
     model = CLIPModel.from_pretrained(source)
-    sample = _sample(bundled, model, phrases.texts)
+    sample = _sample(bundled, model, AutoTokenizer.from_pretrained(source), phrases.texts)
     draw = torch.Generator().manual_seed(seed)
     image = _Tower(model.vision_model.post_layernorm, model.visual_projection, sample.varied)
     text = _Tower(model.text_model.final_layer_norm, model.text_projection, sample.phrases, phrases.weights)
@@ -309,19 +309,23 @@ def _layer(weight: Tensor) -> nn.Linear:
 
 
 @torch.no_grad()
-def _sample(encoder: ClipEncoder, model: CLIPModel, phrases: Sequence[str], seed: int = 0) -> Sample:
+def _sample(
+    encoder: ClipEncoder, model: CLIPModel, tokenizer: Any, phrases: Sequence[str], seed: int = 0
+) -> Sample:
     """Hidden states of crops of the second bundled capture and of phrases."""
     rng = np.random.default_rng(seed)
     photos, side = _photos(demo_capture("second") / "images"), encoder.image_size
+    limit = model.config.text_config.max_position_embeddings
 
     def images(pixels: Tensor) -> Tensor:
         parts = ((pixels - encoder._mean) / encoder._std).split(200)
         return torch.cat([model.vision_model(pixel_values=part).pooler_output for part in parts]).double()
 
     def texts(words: Sequence[str]) -> Tensor:
-        parts = [words[start : start + 64] for start in range(0, len(words), 64)]
+        parts = [list(words[start : start + 64]) for start in range(0, len(words), 64)]
+        settings = {"padding": True, "truncation": True, "max_length": limit, "return_tensors": "pt"}
         return torch.cat(
-            [model.text_model(**encoder._text_inputs(list(part))).pooler_output for part in parts]
+            [model.text_model(**tokenizer(part, **settings)).pooler_output for part in parts]
         ).double()
 
     things, names = thing_crops(demo_capture("second"), side)
