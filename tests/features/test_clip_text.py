@@ -16,7 +16,7 @@ from lexsplat.features.hub import model_folder
 from lexsplat.features.text import load_text
 from lexsplat.runtime.errors import ModelError
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 TEXTS = [
     "apple",
@@ -57,7 +57,6 @@ def test_prompts_encoded_together_have_the_embeddings_of_each():
     torch.testing.assert_close(tower.encode_together(texts), tower.encode_text(texts), atol=1e-6, rtol=0)
 
 
-@pytest.mark.slow
 def test_the_light_tower_is_exported_as_the_whole_model_is():
     light, whole = (load("bundled").text_tower() for load in (load_text, load_clip))
     assert light.tensors.keys() == whole.tensors.keys()
@@ -76,19 +75,16 @@ def changed_config(folder, target, **text):
     return copy
 
 
-@pytest.mark.slow
 def test_the_light_tower_gives_the_embeddings_of_the_bundled_model():
     assert_same_embeddings(model_folder("bundled", "clip"))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("text", [{}, {"hidden_act": "gelu"}, {"eos_token_id": 2}])
 def test_the_light_tower_gives_the_embeddings_of_transformers_in_all_variants(clip_folder, tmp_path, text):
     # 2 is the end token of OpenAI's and LAION's files; the model then takes the largest number.
     assert_same_embeddings(changed_config(clip_folder, tmp_path / "copy", **text))
 
 
-@pytest.mark.slow
 def test_the_light_tower_reads_the_names_of_open_clip_and_half_precision(clip_folder, tmp_path):
     from transformers import CLIPModel
 
@@ -100,7 +96,6 @@ def test_the_light_tower_reads_the_names_of_open_clip_and_half_precision(clip_fo
     assert_same_embeddings(copy, model.half().float())
 
 
-@pytest.mark.slow
 def test_the_light_tower_equals_transformers_at_the_size_of_vit_b_16(clip_folder, tmp_path):
     from transformers import CLIPConfig, CLIPModel
 
@@ -115,7 +110,6 @@ def test_the_light_tower_equals_transformers_at_the_size_of_vit_b_16(clip_folder
     assert_same_embeddings(folder)
 
 
-@pytest.mark.slow
 def test_what_the_light_tower_does_not_know_is_left_to_transformers(clip_folder, tmp_path):
     def refused(**text) -> bool:
         place = tmp_path / str(len(list(tmp_path.iterdir())))
@@ -130,7 +124,6 @@ def test_what_the_light_tower_does_not_know_is_left_to_transformers(clip_folder,
     assert refused(vocab_size=999)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("load", [load_text, load_clip])
 def test_a_character_of_several_bytes_may_be_several_tokens(load):
     # None of them is a word of the bundled model: 20 times 3 bytes, start and end, of which 24 tokens are read.

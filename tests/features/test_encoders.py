@@ -24,7 +24,7 @@ from lexsplat.runtime.errors import ModelError
 PROMPTS = ["a red apple", "the wooden table", "stack of books next to a lamp"]
 
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 
 @pytest.fixture(autouse=True)

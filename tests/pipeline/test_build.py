@@ -21,7 +21,7 @@ from lexsplat.runtime.memory import parse_bytes
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.scene import open_scene
 
-pytestmark = pytest.mark.usefixtures("color_encoders")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("color_encoders")]
 
 AVERAGED = replace(CONFIG, method="averaged", iterations=4)
 TRAINED = replace(CONFIG, iterations=4)
@@ -93,7 +93,6 @@ def test_a_scene_names_the_method_that_made_it_whatever_its_field_says(
     assert scene.field.method == scene.folder.record["stages"]["language"]["method"] == "toy"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("base", "change", "redone"),
     [
@@ -135,7 +134,6 @@ def test_a_build_stops_after_the_stage_asked_for(six_views, tmp_path):
     assert not (tmp_path / "other").exists()
 
 
-@pytest.mark.slow
 def test_joint_training_makes_features_and_codes_before_the_geometry(six_views, tmp_path):
     joint = replace(TRAINED, joint=True)
     finished = stages_run(six_views, tmp_path / "scene", joint)
@@ -165,7 +163,6 @@ def loaded(tmp_path, monkeypatch) -> list[str]:
     return kinds
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("config", "expected"),
     [
@@ -195,7 +192,6 @@ def test_new_settings_of_the_language_load_no_encoder_where_codes_are_kept(
     assert loaded == []
 
 
-@pytest.mark.slow
 def test_the_encoder_of_photos_is_freed_before_the_language_is_made(six_views, tmp_path, monkeypatch):
     made, alive = [], []
 
@@ -215,7 +211,6 @@ def test_the_encoder_of_photos_is_freed_before_the_language_is_made(six_views, t
     assert alive == [None]
 
 
-@pytest.mark.slow
 def test_every_stage_receives_the_memory_budget(six_views, tmp_path, monkeypatch):
     granted = {}
     for module, name in ((geometry, "reconstruct"), (pipeline, "fit_codebook")):

@@ -16,7 +16,7 @@ from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.folder import SCENE_FILES
 from lexsplat.scenes.scene import open_scene
 
-pytestmark = pytest.mark.usefixtures("color_encoders")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("color_encoders")]
 
 TRAINED = replace(CONFIG, iterations=4)
 

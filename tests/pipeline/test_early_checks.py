@@ -28,6 +28,8 @@ from lexsplat.runtime.errors import BackendError, CaptureError, FileFormatError,
 from lexsplat.runtime.progress import NOTE
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 
+pytestmark = pytest.mark.slow
+
 CONFIG = BuildConfig(clip="bundled", dino="none", device="cpu", iterations=2)
 
 
@@ -210,7 +212,6 @@ def test_the_time_of_the_features_is_reported_first(clip_folder, tmp_path, caplo
     assert "words match bundled images by" in caplog.text, "random weights match no words"
 
 
-@pytest.mark.slow
 def test_a_build_that_stops_for_its_encoder_goes_on_from_what_was_finished(
     tiny_capture, tmp_path, monkeypatch
 ):

@@ -20,6 +20,8 @@ from lexsplat.scenes.filling import Fill, fill_for
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.views import StoredView
 
+pytestmark = pytest.mark.slow
+
 LEFT, RIGHT = np.array([0.8, 0.3, 0.1]), np.array([0.2, 0.5, 0.7])
 
 
