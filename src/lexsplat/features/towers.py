@@ -1,7 +1,7 @@
 """Image towers of CLIP and DINO without transformers, whose import alone takes seconds.
 
-Their modules have the names of tensors in the Hub's files. A folder of another layout, or one that is not whole, is
-left to transformers, which loads it or refuses it. Tests compare the two.
+Their modules are named as the tensors in the Hub's files. What has another layout, or is not whole, is left to
+transformers, which loads or refuses it. Tests compare the two.
 """
 
 from __future__ import annotations
