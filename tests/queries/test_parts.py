@@ -1,7 +1,9 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
+from scipy.sparse import csr_array
 from support.splats import solid
 
 from lexsplat.geometry.gaussians import SH_C0
@@ -101,6 +103,21 @@ def test_a_part_does_not_grow_where_nothing_stops_it():
     own, thing = torch.from_numpy(scores).float(), torch.from_numpy(places != TABLE)
     grown = (part_scores(own, thing, gaussians, torch.ones(len(places))) >= SEGMENT_THRESHOLD).numpy()
     assert (grown & (head < 0.6)).sum() == 0, "around the top of a ball each wider border is longer"
+
+
+@pytest.mark.parametrize(("neck", "taken"), [(0.05, 40), (0.1, 20)])
+def test_a_part_grows_only_to_a_border_of_at_most_half_the_length(neck, taken):
+    """Links of weight .3 lead from each of 20 Gaussians of a head to 20 of an ear, and of ``neck`` from 40 to the head."""
+    ear, head, rest = np.arange(20), np.arange(20, 40), np.arange(40, 80)
+    links = np.zeros((80, 80))
+    for group, other, weight in ((ear, head, 0.3), (head, ear, 0.3), (head, rest, 0.1), (rest, head, neck)):
+        links[np.ix_(group, other)] = weight / len(other)
+    for group in (ear, head, rest):
+        links[np.ix_(group, group)] = (1 - links[group].sum(1, keepdims=True)) / len(group)
+    smooth = np.repeat([1.0, 0.6, 0.0], [20, 20, 40])
+    assert links[np.ix_(head, ear)].sum() == pytest.approx(6), "the border of the ear"
+    assert links[np.ix_(rest, head)].sum() == pytest.approx(40 * neck), "and that of the head: 2 or 4"
+    assert parts._grown(smooth, 0.05, 0.9, csr_array(links)).nonzero()[0].tolist() == list(range(taken))
 
 
 def test_a_part_with_a_border_of_its_own_does_not_grow_to_another_one():

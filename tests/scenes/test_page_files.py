@@ -348,7 +348,7 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(
                 segments="s",
                 segment_rule=dict.fromkeys(segment_rule(), 1),
             ),
-            "23 numbers in language.part_rule",
+            "24 numbers in language.part_rule",
         ),
         (lambda m: m["selection_rule"].pop("link"), "11 numbers in selection_rule"),
         (lambda m: m.pop("grammar"), "an object in grammar"),

@@ -121,6 +121,8 @@ export interface PartRule {
   nearest: number;
   /** A border that links of this total weight cross is short enough. */
   short: number;
+  /** The longest border to grow to, relative to that of the best scores. */
+  shorter: number;
   /** Scores in a part start at this share of the way from the border to 1. */
   firm: number;
   outside: number;
@@ -258,7 +260,7 @@ const FIELDS: [string, string, (value: unknown) => boolean][] = [
 const SEGMENT_RULE = ["lowest", "border", "own_share", "steepness", "most_certain", "below", "threshold"];
 const PART_RULE = [
   "held", "fewest", "neighbors", "color", "score", "rounds", "shared", "best", "lowest", "mostly", "all", "usual", "spread", "first",
-  "last", "steps", "near", "few", "walked", "nearest", "short", "firm", "outside",
+  "last", "steps", "near", "few", "walked", "nearest", "short", "shorter", "firm", "outside",
 ];
 const SELECTION_RULE = [
   "threshold", "link", "smallest_share", "convincing", "peak_count", "faint", "same_surface", "least_surface",

@@ -60,7 +60,7 @@ function weighted(values: Float64Array, thing: number[], geometry: Geometry, wei
   });
 }
 
-/** The part: from the border on, and what random walks add to it where that shortens its border. */
+/** The part: from the border on, and what random walks add to it where that makes its border much shorter. */
 function grown(smooth: Float64Array, base: number, border: number, links: Link[][], rule: PartRule): boolean[] {
   const isBetween = (n: number): boolean => smooth[n] < border && smooth[n] > base;
   const between = Array.from(smooth.keys()).filter(isBetween);
@@ -83,11 +83,14 @@ function grown(smooth: Float64Array, base: number, border: number, links: Link[]
   });
   const isPart = Array.from(smooth, (score) => score >= border);
   const count = isPart.filter(Boolean).length;
-  let [size, fewest, crossing] = [0, Infinity, 0];
+  let [size, fewest, most, crossing] = [0, Infinity, Infinity, 0];
   order.forEach((n, place) => {
     crossing += change[place];
-    if (place + 1 >= count && reached[n] >= rule.nearest && Math.max(crossing, rule.short) < fewest) [size, fewest] = [place + 1, Math.max(crossing, rule.short)];
+    const length = Math.max(crossing, rule.short);
+    if (place + 1 === count) most = rule.shorter * length;
+    if (place + 1 >= count && reached[n] >= rule.nearest && length < fewest) [size, fewest] = [place + 1, length];
   });
+  if (fewest > most) return isPart;
   return isPart.map((is, n) => is || rank[n] < size);
 }
 

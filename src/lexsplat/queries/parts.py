@@ -11,7 +11,7 @@ that show a part show its surroundings. So segments do not say where a part ends
    scores take the place of the median.
 4. The best scores alone may be the middle of a handle. Random walks along the links (Grady 2006) tell how near what
    scores less is to the part. The part grows in this order to where the fewest links cross its border: where a handle
-   meets its mug.
+   meets its mug. That border must be at most half as long, or an ear would grow to its head, whose neck is narrow.
 
 The constants were chosen on the second bundled scene and on the scene ``parts`` of tools/demo_scene
 (docs/lab-notes/2026-11-objects.md). Dimension letters: N Gaussians, M of the thing.
@@ -54,6 +54,8 @@ WALKED, NEAREST = 50, 0.2
 """Steps of the random walks, and the least share of them that end in the part where it may grow."""
 SHORT = 1.0
 """A border that links of this total weight cross is short enough: a nose in black does not grow to the muzzle."""
+SHORTER = 0.5
+"""The longest border to grow to, relative to that of the best scores: those of heads are .49 to .66, of handles below."""
 FIRM = 0.5
 """Scores in a part start at this share of the way from the border to 1. Pixels blend them with those beside it: with
 scores at the border, a pixel would have to show the part alone."""
@@ -136,7 +138,7 @@ def _links(values: FloatArray, means: FloatArray, colors: FloatArray, weights: F
 
 
 def _grown(smooth: FloatArray, base: float, border: float, links: csr_array) -> NDArray[np.bool_]:
-    """The part ``[M]``: from the border on, and what random walks add to it where that shortens its border."""
+    """The part ``[M]``: from the border on, and what random walks add to it where that makes its border much shorter."""
     part = smooth >= border
     between = np.flatnonzero(~part & (smooth > base))
     reached = part.astype(float)
@@ -153,7 +155,11 @@ def _grown(smooth: FloatArray, base: float, border: float, links: csr_array) -> 
     starts, ends = (np.bincount(end[crosses], links.data[crosses], count) for end in (first, last))
     crossing = np.maximum(np.cumsum(starts - ends), SHORT)  # [n]: of the first n + 1
     fewest, most = int(part.sum()), int((reached >= NEAREST).sum())
-    return part | (rank < fewest + crossing[fewest - 1 : most].argmin()) if fewest else part
+    if not fewest:
+        return part
+    choices = crossing[fewest - 1 : most]
+    shortest = int(choices.argmin())
+    return part | (rank < fewest + shortest) if choices[shortest] <= SHORTER * choices[0] else part
 
 
 def _quantile(scores: FloatArray, weights: FloatArray, share: float) -> float:

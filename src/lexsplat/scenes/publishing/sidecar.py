@@ -46,7 +46,7 @@ def part_rule() -> dict[str, float]:
         "first": float(parts.PLACES[0]),
         "last": float(parts.PLACES[-1]),
         "steps": len(parts.PLACES),
-        **constants_of(parts, "NEAR", "FEW", "WALKED", "NEAREST", "SHORT", "FIRM", "OUTSIDE"),
+        **constants_of(parts, "NEAR", "FEW", "WALKED", "NEAREST", "SHORT", "SHORTER", "FIRM", "OUTSIDE"),
     }
 
 
