@@ -107,7 +107,7 @@ def test_a_part_does_not_grow_where_nothing_stops_it():
 
 @pytest.mark.parametrize(("neck", "taken"), [(0.05, 40), (0.1, 20)])
 def test_a_part_grows_only_to_a_border_of_at_most_half_the_length(neck, taken):
-    """Links of weight .3 lead from each of 20 Gaussians of a head to 20 of an ear, and of ``neck`` from 40 to the head."""
+    """Links of .3 lead from each of 20 Gaussians of a head to 20 of an ear, and of ``neck`` from 40 to the head."""
     ear, head, rest = np.arange(20), np.arange(20, 40), np.arange(40, 80)
     links = np.zeros((80, 80))
     for group, other, weight in ((ear, head, 0.3), (head, ear, 0.3), (head, rest, 0.1), (rest, head, neck)):

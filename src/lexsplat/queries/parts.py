@@ -55,7 +55,7 @@ WALKED, NEAREST = 50, 0.2
 SHORT = 1.0
 """A border that links of this total weight cross is short enough: a nose in black does not grow to the muzzle."""
 SHORTER = 0.5
-"""The longest border to grow to, relative to that of the best scores: those of heads are .49 to .66, of handles below."""
+"""The longest border to grow to, relative to that of the best scores: heads have .49 to .66, handles less."""
 FIRM = 0.5
 """Scores in a part start at this share of the way from the border to 1. Pixels blend them with those beside it: with
 scores at the border, a pixel would have to show the part alone."""
@@ -138,7 +138,7 @@ def _links(values: FloatArray, means: FloatArray, colors: FloatArray, weights: F
 
 
 def _grown(smooth: FloatArray, base: float, border: float, links: csr_array) -> NDArray[np.bool_]:
-    """The part ``[M]``: from the border on, and what random walks add to it where that makes its border much shorter."""
+    """The part ``[M]``: from the border on, and what random walks add where that makes its border much shorter."""
     part = smooth >= border
     between = np.flatnonzero(~part & (smooth > base))
     reached = part.astype(float)
