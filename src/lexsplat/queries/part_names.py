@@ -19,7 +19,7 @@ NAMES = tuple(sorted(PARTS))
 """The names that are compared."""
 RIVAL = 1.15
 """Factor by which another name describes a place better than that of the part, from which the part is doubtful."""
-_ALIKE = "stem stalk, wheel tire, lid cap cork, foot paw leg, leaf petal, cord string, head face"
+_ALIKE = "stem stalk, wheel tire, lid cap cork, foot paw leg, leaf petal, cord string, head face, stand base"
 ALIKE = tuple(group.split() for group in words(_ALIKE))
 """Names that people give to one part, of which the best counts."""
 DOUBTFUL = "names of other parts fit this place better"

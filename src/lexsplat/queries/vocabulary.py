@@ -33,7 +33,7 @@ _STATES = """
 _PARTS = """
     handle, lid, cap, spout, neck, rim, knob, stem, stalk, leaf, petal, shade, cord, string, flame, wick, cork,
     spine, page, button, sole, lace, wheel, tire, roof, wing, beak, head, face, nose, ear, eye, mouth, tail, belly,
-    paw, foot, leg, arm
+    paw, foot, leg, arm, stand, base
 """
 _SURFACES = """
     table, tablecloth, desk, cloth, wall, floor, ceiling, carpet, grass, road, sky, water, sand, stairs, wood, metal,
