@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+from support.forked_commands import Command
 
 PACKAGE = Path(__file__).parents[2] / "src" / "lexsplat"
 
@@ -64,32 +65,28 @@ print(len(pycolmap.Camera(model="PINHOLE", width=4, height=4, params=[4, 4, 2, 2
     assert done.stdout == "stopped\n4\n"
 
 
+def import_pycolmap() -> None:
+    from lexsplat.captures.sfm.pycolmap_import import pycolmap
+
+    assert pycolmap.Camera(model="PINHOLE", width=4, height=4, params=[4, 4, 2, 2])
+
+
 def test_sigterm_ends_a_build_at_once_and_keeps_its_checkpoints(tiny_capture, tmp_path):
     from lexsplat.runtime.files import read_tensors
 
-    command = [
-        sys.executable,
-        "-m",
-        "lexsplat.cli",
-        "reconstruct",
-        str(tiny_capture),
-        "--output",
-        str(tmp_path),
-    ]
-    command += ["--device", "cpu", "--iterations", "100000", "--checkpoint-seconds", "0.2"]
+    words = ["reconstruct", str(tiny_capture), "--output", str(tmp_path)]
+    words += ["--device", "cpu", "--iterations", "100000", "--checkpoint-seconds", "0.2"]
     saved = tmp_path / "checkpoints" / "reconstruct.training.safetensors"
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            started = time.monotonic()
-            while not saved.exists() and process.poll() is None and time.monotonic() - started < 300:
-                time.sleep(0.1)
-            assert saved.exists()
-            asked = time.monotonic()
-            process.terminate()
-            _, errors = process.communicate(timeout=60)
-        finally:
-            process.kill()
-    assert process.returncode == -signal.SIGTERM
+    with Command(*words, prepare=import_pycolmap) as process:
+        started = time.monotonic()
+        while not saved.exists() and time.monotonic() - started < 300:
+            time.sleep(0.05)
+        assert saved.exists(), process.errors()
+        asked = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        status = process.wait(60)
+        errors = process.errors()
+    assert status == -signal.SIGTERM
     assert time.monotonic() - asked < 20, "the machine may be busy; undisturbed it is a tenth of a second"
     assert "***" not in errors
     state, _ = read_tensors(saved)

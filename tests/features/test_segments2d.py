@@ -56,10 +56,7 @@ def pooled_by_loops(features: np.ndarray, levels: np.ndarray) -> np.ndarray:
         means = []
         for level in levels:
             if level[row, column] >= 0:
-                total = np.zeros(features.shape[-1])
-                for other in np.ndindex(features.shape[:2]):
-                    if level[other] == level[row, column]:
-                        total += features[other]
+                total = features.astype(np.float64)[level == level[row, column]].sum(0)
                 means.append(total / np.linalg.norm(total))
         if means:
             found[row, column] = np.mean(means, axis=0)
@@ -375,7 +372,8 @@ def test_exact_masks_improve_a_scene_and_another_source_makes_it_anew(
         *QUICK_BUILD, "--features.segments",
     ]  # fmt: skip
     assert cli.main([*command, str(exact)]) == 0
-    assert measured(output) > measured(built) + 0.15
+    without = measured(built)
+    assert measured(output) > without + 0.15
     record = json.loads((output / "scene.json").read_text())
     assert record["config"]["features"]["segments"] == str(exact.resolve())
     capsys.readouterr()
@@ -387,4 +385,4 @@ def test_exact_masks_improve_a_scene_and_another_source_makes_it_anew(
     assert "features: 1/1 kept" not in capsys.readouterr().err
     assert cli.main(["info", str(output), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["language_levels"] == 2
-    assert measured(output) > measured(built) + 0.15
+    assert measured(output) > without + 0.15

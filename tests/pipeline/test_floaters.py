@@ -15,12 +15,18 @@ from support.surfaces import on_table
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.pipeline.config import BuildConfig
-from lexsplat.pipeline.viewpoints import choosing, floaters, stage, surroundings
+from lexsplat.pipeline.viewpoints import candidates, choosing, floaters, stage, surroundings
 from lexsplat.pipeline.viewpoints.floaters import find_floaters, isolation
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.formats.ply import write_ply
 
 UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(autouse=True)
+def _few_looks(monkeypatch) -> None:
+    """Half as many looks from above and around as usual."""
+    monkeypatch.setattr(candidates, "_AZIMUTHS", 8)
 
 
 def dusty() -> tuple[Gaussians, Gaussians]:

@@ -22,7 +22,14 @@ from lexsplat.pipeline.viewpoints.upward import UpwardDirections, find_upward
 from lexsplat.runtime.errors import CaptureError
 
 UP = np.array([0.0, 0.0, 1.0])
+
 ALL, NO_CEILING, NO_FRONT = (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4), (0, 1, 3, 4, 5)
+
+
+@pytest.fixture(autouse=True)
+def _few_looks(monkeypatch) -> None:
+    """Half as many looks from above and around as usual."""
+    monkeypatch.setattr(candidates, "_AZIMUTHS", 8)
 
 
 def box(low, high, count: int, seed: int, sides=ALL) -> np.ndarray:
@@ -262,8 +269,9 @@ def test_a_room_so_small_that_the_near_plane_cuts_it_is_refused():
 
 
 @pytest.mark.slow
-def test_a_bathroom_is_chosen_from_inside_by_default(caplog):
+def test_a_bathroom_is_chosen_from_inside_by_default(caplog, monkeypatch):
     """As by the command: up is estimated, and there are as many candidates as usual."""
+    monkeypatch.undo()
     with caplog.at_level(logging.WARNING, "lexsplat"):
         chosen: ChosenViews = choose_views(solid(bathroom()))
     positions = np.stack([camera.position for camera in chosen.cameras])

@@ -37,6 +37,7 @@ def _few_candidates(monkeypatch) -> None:
     monkeypatch.setattr(choosing, "SIZE", (240, 180))
     monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 30)
     monkeypatch.setattr(candidates, "_MOST_PLACES", 10)
+    monkeypatch.setattr(candidates, "_AZIMUTHS", 8)
 
 
 def in_room(seed: int = 0) -> np.ndarray:

@@ -78,7 +78,7 @@ def large_capture(tmp_path_factory) -> Path:
         f"1 PINHOLE {WIDTH} {HEIGHT} {WIDTH} {WIDTH} {WIDTH / 2} {HEIGHT / 2}\n"
     )
     (model / "images.txt").write_text("".join(lines))
-    points = np.random.default_rng(0).normal(size=(300, 3)) * 0.5
+    points = np.random.default_rng(0).normal(size=(300, 3)) * 0.1  # small: drawn fast
     rows = (f"{i} {a:.4f} {b:.4f} {c:.4f} 120 90 60 0.5\n" for i, (a, b, c) in enumerate(points, 1))
     (model / "points3D.txt").write_text("".join(rows))
     return folder

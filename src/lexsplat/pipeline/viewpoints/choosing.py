@@ -27,7 +27,7 @@ from lexsplat.pipeline.viewpoints.interior import (
 from lexsplat.pipeline.viewpoints.looking import SMALL, look, look_from_above
 from lexsplat.pipeline.viewpoints.one_photo import Photo, find_photo
 from lexsplat.pipeline.viewpoints.surroundings import SOLID, Surroundings, Target, find_surroundings
-from lexsplat.rendering import accumulate_weights
+from lexsplat.rendering import measure_weights
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.progress import Event, Listener, silent, uncounted
 
@@ -276,7 +276,7 @@ def _good_candidates(
         weights = np.zeros((len(indices), len(looked_at)), np.float32)
         for row, index in enumerate(indices):
             listener(Event("comparison", next(compared), total))
-            weights[row] = accumulate_weights(gaussians, cameras[index]).cpu().numpy()[looked_at]
+            weights[row] = measure_weights(gaussians, cameras[index]).cpu().numpy()[looked_at]
         return weights
 
     weights, elsewhere = weigh(chosen_from), (weigh(others) > _SEEN).any(axis=0)

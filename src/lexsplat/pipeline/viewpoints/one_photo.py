@@ -13,7 +13,7 @@ from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.pipeline.viewpoints.candidates import FOV_Y, around
 from lexsplat.pipeline.viewpoints.surroundings import SOLID, Surroundings, Target
-from lexsplat.rendering import accumulate_weights
+from lexsplat.rendering import measure_weights
 from lexsplat.rendering.compositing import NEAR
 
 _WIDEST = math.tan(math.radians(60))
@@ -98,7 +98,7 @@ def find_photo(gaussians: Gaussians) -> Photo | None:
             np.zeros(3), photo.ahead, photo.up,
             max(1, round(_HEIGHT * float(size[0] / max(size[1], 1e-9)))), _HEIGHT, 2 * math.atan(float(size[1]) / 2),
         )  # fmt: skip
-        weights = accumulate_weights(gaussians, camera).cpu().numpy()[solid]
+        weights = measure_weights(gaussians, camera).cpu().numpy()[solid]
         if (weights > _LEAST_WEIGHT).mean() >= _SEEN:
             return photo
     return None
