@@ -34,6 +34,7 @@ from lexsplat.evaluation.demo import demo_capture
 from lexsplat.features.clip import ClipEncoder
 from lexsplat.features.encoders import load_clip
 from lexsplat.features.hub import model_folder
+from lexsplat.features.text import load_text
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.relevancy import CANONICAL_PHRASES
 from lexsplat.queries.vocabulary import COLORS, words
@@ -421,11 +422,14 @@ def measure(folder: Path, held_out: bool) -> dict[str, float]:
     random = random_crops(_photos(capture / "images")[1::3], np.random.default_rng(1), encoder.image_size)
     weights = phrases.weights / len(phrases.texts)
     crops, things = encoder.encode_images(random).double(), encoder.encode_images(pixels).double()
-    texts = encoder.encode_text(list(phrases.texts)).double()
+    towers = (load_text(name) for name in (str(folder), "bundled"))
+    texts, plain = (
+        getattr(each, "encode_together", each.encode_text)(list(phrases.texts)).double() for each in towers
+    )
     canonical = encoder.encode_text(list(CANONICAL_PHRASES)).double()
     cosines, middle = crops @ texts.T, weights @ texts
     level = cosines.mean(0)
-    plain = (bundled.encode_images(random) @ bundled.encode_text(list(phrases.texts)).T).double()
+    plain = bundled.encode_images(random).double() @ plain.T
     varied, shared = ((each - (each @ weights)[:, None])[:, phrases.known] for each in (cosines, plain))
     shared = shared - shared.mean(0)
     gains = (varied * shared).sum(0) / shared.square().sum(0)

@@ -7,14 +7,14 @@ the Gaussians themselves and the PLY that splat-transform writes, read by plyfil
 from __future__ import annotations
 
 import functools
-import shutil
-import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from support.sog_files import write_version_1
+from support.splat_transform import program, running
 from support.splats import half_turned, largest_differences, tame
 
 from lexsplat.geometry.gaussians import Gaussians
@@ -52,14 +52,6 @@ THEIRS = {
 """Formats that splat-transform writes."""
 
 
-@functools.cache
-def program() -> str | None:
-    """splat-transform, if it is there and runs."""
-    found = shutil.which("splat-transform")
-    runs = found and subprocess.run([found, "--version"], capture_output=True).returncode == 0
-    return found if runs else None
-
-
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(
@@ -69,10 +61,11 @@ pytestmark = [
 ]
 
 
-def transform(source: Path, target: Path, *options: str) -> None:
-    # The palette of SOG is made on a GPU unless told otherwise.
-    command = [str(program()), "-q", "-g", "cpu", "-w", *options, str(source), str(target)]
-    subprocess.run(command, check=True, capture_output=True)
+@pytest.fixture(scope="module")
+def transform() -> Iterator[Callable[..., None]]:
+    """Runs splat-transform with files and options; its palette of SOG is made on a GPU unless told otherwise."""
+    with running() as run:
+        yield functools.partial(run, "-q", "-g", "cpu", "-w")
 
 
 def by_plyfile(path: Path) -> Gaussians:
@@ -113,7 +106,7 @@ def check(expected: Gaussians, found: Gaussians, limits: dict[str, float]) -> No
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("ending", list(OURS))
-def test_splat_transform_reads_what_lexsplat_writes(tmp_path, ending, degree):
+def test_splat_transform_reads_what_lexsplat_writes(tmp_path, transform, ending, degree):
     if ending in (".compressed.ply", ".ksplat"):
         pytest.importorskip("gaussforge")
     g = tame(COUNT, degree, antialiased=degree == 2)
@@ -130,7 +123,7 @@ def test_splat_transform_reads_what_lexsplat_writes(tmp_path, ending, degree):
     # meta.json is .sog without its archive
     [(ending, degree) for ending in THEIRS for degree in ((0, 3) if ending == "meta.json" else range(4))],
 )
-def test_lexsplat_reads_what_splat_transform_writes(tmp_path, ending, degree):
+def test_lexsplat_reads_what_splat_transform_writes(tmp_path, transform, ending, degree):
     if ending == ".compressed.ply":
         pytest.importorskip("gaussforge")
     g = tame(FEW if THEIRS[ending] is SOG else COUNT, degree, antialiased=degree == 2)
@@ -138,7 +131,7 @@ def test_lexsplat_reads_what_splat_transform_writes(tmp_path, ending, degree):
     write_ply(g, tmp_path / "g.ply")
     (tmp_path / "out").mkdir()
     target = tmp_path / "out" / (ending if ending == "meta.json" else f"theirs{ending}")
-    transform(tmp_path / "g.ply", target, *(["--spz-version", "3"] if ending == ".v3.spz" else []))
+    transform(*(["--spz-version", "3"] if ending == ".v3.spz" else []), tmp_path / "g.ply", target)
     found = read_splats(target)
     # They share a palette even where each could have an entry: the nearest, but not near.
     limits = THEIRS[ending] | ({"shN": 0.5} if THEIRS[ending] is SOG else {})
@@ -147,7 +140,7 @@ def test_lexsplat_reads_what_splat_transform_writes(tmp_path, ending, degree):
         assert found.antialiased == g.antialiased
 
 
-def test_the_glb_of_lexsplat_is_the_one_of_splat_transform_but_for_its_axes(tmp_path):
+def test_the_glb_of_lexsplat_is_the_one_of_splat_transform_but_for_its_axes(tmp_path, transform):
     """splat-transform reads no glTF; this compares what both wrote, read by lexsplat."""
     g = tame(COUNT, 3)
     write_ply(g, tmp_path / "g.ply")
@@ -156,18 +149,17 @@ def test_the_glb_of_lexsplat_is_the_one_of_splat_transform_but_for_its_axes(tmp_
     check(read_splats(tmp_path / "ours.glb"), read_splats(tmp_path / "theirs.glb"), EXACT)
 
 
-def test_both_read_sog_of_version_1_alike(tmp_path):
+def test_both_read_sog_of_version_1_alike(tmp_path, transform):
     write_version_1(tmp_path / "a", 40)
     transform(tmp_path / "a" / "meta.json", tmp_path / "theirs.ply")
     check(by_plyfile(tmp_path / "theirs.ply"), read_splats(tmp_path / "a"), EXACT)
 
 
-def test_the_finest_level_of_its_streamed_sog_is_read(tmp_path):
+def test_the_finest_level_of_its_streamed_sog_is_read(tmp_path, transform):
     g = tame(FEW, 1)
     write_ply(g, tmp_path / "fine.ply")
     write_ply(g.select(torch.arange(0, FEW, 4)), tmp_path / "coarse.ply")
-    levels = [str(tmp_path / "fine.ply"), "-l", "0", str(tmp_path / "coarse.ply"), "-l", "1"]
     (tmp_path / "out").mkdir()
-    command = [str(program()), "-q", "-g", "cpu", *levels, str(tmp_path / "out" / "lod-meta.json")]
-    subprocess.run(command, check=True, capture_output=True)
+    levels = tmp_path / "fine.ply", "-l", "0", tmp_path / "coarse.ply", "-l", "1"
+    transform(*levels, tmp_path / "out" / "lod-meta.json")
     check(g, read_splats(tmp_path / "out"), SOG | {"shN": 0.5})

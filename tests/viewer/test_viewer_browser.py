@@ -45,12 +45,18 @@ def viewer() -> Iterator[ViewerServer]:
 
 
 @pytest.fixture(scope="module")
-def shared_page(browser) -> Iterator[Any]:
-    """A page for tests that edit nothing."""
+def shared_viewer() -> Iterator[ViewerServer]:
+    """The viewer of `shared_page`."""
     with serving_balls() as running:
-        opened = open_page(browser, f"{running.url}/#view=view0", 720, 480)
-        yield opened
-        opened.close()
+        yield running
+
+
+@pytest.fixture(scope="module")
+def shared_page(browser, shared_viewer) -> Iterator[Any]:
+    """A page for tests that edit nothing."""
+    opened = open_page(browser, f"{shared_viewer.url}/#view=view0", 720, 480)
+    yield opened
+    opened.close()
 
 
 @pytest.fixture
@@ -96,7 +102,8 @@ def test_an_error_of_the_server_is_reported_in_one_line(shared_page):
     until(page, "document.querySelector('.status')?.textContent.includes('quotation marks in pairs')")
 
 
-def test_a_threshold_by_hand_is_asked_of_the_server(page, viewer):
+def test_a_threshold_by_hand_is_asked_of_the_server(shared_page):
+    page = shared_page
     ask(page, "ball 2")
     page.locator(".threshold input").fill("0")
     until(page, f"lexsplat.app.answers[0].places?.flatMap((one) => one.splats).length > {300}")
@@ -116,11 +123,12 @@ def test_a_click_names_and_selects_the_object(page, viewer):
     assert sorted(splats) == np.flatnonzero(viewer.ground_truth.labels == nearest).tolist()
 
 
-def test_a_selection_is_described_and_downloaded(page, viewer, tmp_path):
+def test_a_selection_is_described_and_downloaded(shared_page, shared_viewer, tmp_path):
+    page = shared_page
     ask(page, "ball 3")
     page.locator(".bench summary").click()
     until(page, "document.querySelector('.bench .examples')?.textContent.includes('view')")
-    size = viewer.scene.select("ball 3").size
+    size = shared_viewer.scene.select("ball 3").size
     assert f"{size[0]:.3g}"[:4] in page.locator(".bench .fine:not(.taken)").inner_text()
     with page.expect_download() as started:
         page.get_by_role("button", name="Download").click()
@@ -270,7 +278,8 @@ def test_a_video_has_many_pictures_also_where_they_take_long(shared_page):
     assert drawn >= 5
 
 
-def test_what_the_server_did_not_understand_is_not_denied_and_long_texts_stay_in_the_box(page):
+def test_what_the_server_did_not_understand_is_not_denied_and_long_texts_stay_in_the_box(shared_page):
+    page = shared_page
     ask(page, "why is qwer so round")
     assert page.locator(".card .state").inner_text() != "not in this scene"
     assert page.evaluate("lexsplat.app.answers[0].unknown")

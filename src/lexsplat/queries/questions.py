@@ -330,7 +330,7 @@ FOR_PAGES = {
 }  # fmt: skip
 """Patterns by which published pages read questions (`lexsplat.scenes.publishing.grammar`)."""
 REPLACED = {
-    "contractions": [(re.compile(pattern, re.IGNORECASE), instead) for pattern, instead in CONTRACTIONS],
+    "contractions": list(CONTRACTIONS),
     "reworded": list(REWORDED),
     "frames": list(_COMPILED),
 }

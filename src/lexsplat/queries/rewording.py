@@ -7,19 +7,22 @@ import re
 from lexsplat.queries.leftovers import NUMBERS
 from lexsplat.queries.vocabulary import COLORS, NAMES, PARTS
 
-CONTRACTIONS = (
-    (r"[\u2018\u2019\u02bc]", "'"),
-    (r"\b(what|where|who|that|there|it|here|which|how)'s\b", r"\1 is"),
-    (r"\b(what|where|who|that|there|which|how|they|we|you)'re\b", r"\1 are"),
-    (r"\bcan't\b", "can not"),
-    (r"\bwon't\b", "will not"),
-    (r"n't\b", " not"),
-    (r"\bi'm\b", "i am"),
-    (r"\b(i|we|you)'ve\b", r"\1 have"),
-    (r"\b(i|we|you)'d\b", r"\1 would"),
-    (r"\b(what|where)s\b", r"\1 is"),
-    (r"\bgrey\b", "gray"),
-    (rf"\b({'|'.join(sorted(NAMES))})'s (?=\w)", r"\1 "),
+CONTRACTIONS = tuple(
+    (re.compile(pattern, re.IGNORECASE), instead)
+    for pattern, instead in (
+        (r"[\u2018\u2019\u02bc]", "'"),
+        (r"\b(what|where|who|that|there|it|here|which|how)'s\b", r"\1 is"),
+        (r"\b(what|where|who|that|there|which|how|they|we|you)'re\b", r"\1 are"),
+        (r"\bcan't\b", "can not"),
+        (r"\bwon't\b", "will not"),
+        (r"n't\b", " not"),
+        (r"\bi'm\b", "i am"),
+        (r"\b(i|we|you)'ve\b", r"\1 have"),
+        (r"\b(i|we|you)'d\b", r"\1 would"),
+        (r"\b(what|where)s\b", r"\1 is"),
+        (r"\bgrey\b", "gray"),
+        (rf"\b({'|'.join(sorted(NAMES))})'s (?=\w)", r"\1 "),
+    )
 )
 _NEGATIVE = re.compile(
     r"^((?:(?:please|hey|hi|so|well|ok|okay)[\s,]+)*(?:is|are|was|were|does|did|has|had|"
@@ -149,8 +152,7 @@ def in_full(words: str) -> str:
 
     "Isn't the mug on the table?" asks what "is the mug on the table?" asks.
     """
-    for contraction, long in CONTRACTIONS:
-        words = re.sub(contraction, long, words, flags=re.IGNORECASE)
-    for pattern, instead in REWORDED:
-        words = pattern.sub(instead, words)
+    for pattern, instead in (*CONTRACTIONS, *REWORDED):
+        if pattern.search(words):  # ten times as fast as `sub`, which reads its template first
+            words = pattern.sub(instead, words)
     return words

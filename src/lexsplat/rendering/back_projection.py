@@ -58,12 +58,14 @@ def accumulate_weights(
     return back_project(gaussians, camera, everywhere, prepared)[:, 0]
 
 
-def measure_weights(gaussians: Gaussians, camera: Camera) -> Tensor:
+def measure_weights(gaussians: Gaussians, camera: Camera, *, prepared: PreparedView | None = None) -> Tensor:
     """`accumulate_weights` up to rounding ``[N]``; on a CPU it blends the view once instead of forth and back."""
     if not hasattr(backends.backend_for(gaussians), "weigh_cells"):
-        return accumulate_weights(gaussians, camera)
+        return accumulate_weights(gaussians, camera, prepared=prepared)
     everywhere = torch.ones(camera.height, camera.width)
-    return weigh_cells(gaussians, camera, (1, 1), everywhere, prepare(gaussians, camera)).totals()
+    if prepared is None:
+        prepared = prepare(gaussians, camera)
+    return weigh_cells(gaussians, camera, (1, 1), everywhere, prepared).totals()
 
 
 class CellWeights(Protocol):

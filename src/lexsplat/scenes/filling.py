@@ -42,10 +42,10 @@ from lexsplat.scenes.surfaces import (
     REACH,
     THICK,
     Orthophoto,
+    Views,
+    covering,
     from_above,
-    looked_up,
     photographed,
-    seen_weights,
     surface_below,
 )
 
@@ -166,11 +166,11 @@ def fill_for(
     """
     gone = chosen.mask.cpu().numpy().copy()
     shown = np.zeros_like(gone) if hidden is None else ~hidden.cpu().numpy()
-    things, found = chosen.instances, list[Fill]()
+    things, found, views = chosen.instances, list[Fill](), Views(chosen.gaussians, cameras)
     try:
         for done, thing in enumerate(things):
             listener(Event("fill", done, len(things)))
-            fill = _fill_below(thing, gone, shown, cameras, segments)
+            fill = _fill_below(thing, gone, shown, views, segments)
             found += [] if fill is None else [fill]
     finally:  # a viewer goes on after an error, and its bar ends
         listener(Event("fill", len(things), len(things)))
@@ -181,7 +181,7 @@ def fill_for(
 
 
 def _fill_below(
-    thing: Selection, gone: Mask, shown: Mask, cameras: Sequence[Camera], segments: Segments | None
+    thing: Selection, gone: Mask, shown: Mask, views: Views, segments: Segments | None
 ) -> Fill | None:
     """The Gaussians that close the surface under one thing; remains there are added to ``gone [N]``.
 
@@ -195,13 +195,13 @@ def _fill_below(
         return None
     local = (means - surface.origin) @ surface.axes.T
     flat = ~gone & solid & (np.abs(local[:, 2]) <= THICK * surface.radius)
-    photo = photographed(gaussians, gone, surface, flat, cameras)
+    photo = photographed(views, gone, surface, flat)
     unseen = binary_dilation(photo.covered > _HIDDEN, iterations=_BORDER)
     inside = _at(unseen, local[:, :2], photo) & (np.abs(local[:, 2]) <= THICK * surface.radius)
     inside &= ~_standing(local, own & solid, inside & shown)
-    stuffing = _stuffing(gaussians, own, gone | inside, cameras)
+    stuffing = _stuffing(views, own, gone | inside)
     inside |= stuffing & ~_standing(local, own & solid, stuffing & shown)
-    revealed = _revealed(gaussians, own, gone, cameras) & (local[:, 2] >= -THICK * surface.radius)
+    revealed = _revealed(views, own, gone) & (local[:, 2] >= -THICK * surface.radius)
     low, high = np.quantile(local[own & solid, 2], [0.02, 0.98])
     if high - low < _SHEET * surface.radius:  # on a cloth stand things, whose bottoms no photo shows
         revealed &= ~_standing(local, own & solid, revealed)
@@ -280,28 +280,25 @@ def _standing(local: FloatArray, thing: Mask, among: Mask) -> Mask:
     return found
 
 
-def _stuffing(gaussians: Gaussians, own: Mask, gone: Mask, cameras: Sequence[Camera]) -> Mask:
+def _stuffing(views: Views, own: Mask, gone: Mask) -> Mask:
     """The Gaussians ``[N]`` within a thing's hull that hardly any view sees, because the thing hides them."""
-    means = gaussians.means.detach().cpu().double().numpy()
+    means = views.gaussians.means.detach().cpu().double().numpy()
     places = np.flatnonzero(~gone)
     places = places[inside_hull(means[own], means[places])]
     found = np.zeros(len(gone), bool)
-    if len(places) and cameras:
-        _, covered, _ = looked_up(gaussians, gone, means[places], cameras, 0.0)
-        found[places] = covered > _STUFFED
+    if len(places) and views.of:
+        found[places] = covering(views, gone, means[places]) > _STUFFED
     return found
 
 
-def _revealed(gaussians: Gaussians, own: Mask, gone: Mask, cameras: Sequence[Camera]) -> Mask:
+def _revealed(views: Views, own: Mask, gone: Mask) -> Mask:
     """The Gaussians ``[N]`` around a thing of which the views show several times as much once the thing is gone."""
-    means = gaussians.means.detach().cpu().double().numpy()
+    means = views.gaussians.means.detach().cpu().double().numpy()
     places = np.flatnonzero(~gone)
     places = places[inside_hull(means[own], means[places], _AROUND)]
     found = np.zeros(len(gone), bool)
     if len(places):
-        weights = [seen_weights(gaussians, kept, cameras) for kept in (np.ones_like(gone), ~gone)]
-        before, after = (each[places] for each in weights)
-        found[places] = after > _REVEALED * before
+        found[places] = views.weights_without(gone)[places] > _REVEALED * views.weights[places]
     return found
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.rendering import measure_weights, render
+from lexsplat.rendering import PreparedView, measure_weights, prepare, render
 from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.completing import mean_around
 
@@ -45,6 +46,8 @@ _VIEWS, _LONG_SIDE = 16, 240
 """Number and longer side of the views that are looked at."""
 _BEFORE = 0.2
 """Share of a pixel from which the thing in it hides what lies behind."""
+_PREPARED_BYTES = 2**28
+"""Memory for prepared views, which are looked at several times."""
 
 
 class Surface(NamedTuple):
@@ -116,6 +119,48 @@ def _across(up: FloatArray) -> tuple[FloatArray, FloatArray]:
     return right, np.cross(up, right)
 
 
+class Views:
+    """Some of the views of a scene, small; those that memory allows are projected and sorted once.
+
+    Args:
+        gaussians: The scene.
+        cameras: Its views, of which `_VIEWS` are taken.
+    """
+
+    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
+        self.gaussians, self.of = gaussians, cameras
+        self.small = [camera.within(_LONG_SIDE) for camera in evenly(cameras, _VIEWS)]
+        self._prepared: dict[int, PreparedView] = {}
+        self._bytes = 0
+
+    def prepared(self, number: int) -> PreparedView:
+        """One of the small views."""
+        if number in self._prepared:
+            return self._prepared[number]
+        view = prepare(self.gaussians, self.small[number])
+        if self._bytes + view.nbytes <= _PREPARED_BYTES:
+            self._prepared[number] = view
+            self._bytes += view.nbytes
+        return view
+
+    @cached_property
+    def weights(self) -> FloatArray:
+        """Visible weights of all Gaussians, in pixels ``[N]``."""
+        found = np.zeros(len(self.gaussians))
+        for number, camera in enumerate(self.small):
+            weights = measure_weights(self.gaussians, camera, prepared=self.prepared(number))
+            found += weights.cpu().double().numpy()
+        return found
+
+    def weights_without(self, gone: Mask) -> FloatArray:
+        """Visible weights of the others where some Gaussians ``[N]`` are gone, in pixels ``[N]``."""
+        others, found = torch.from_numpy(~gone).to(self.gaussians.device), np.zeros(len(gone))
+        drawn = self.gaussians.select(others)
+        for camera in self.small:
+            found[~gone] += measure_weights(drawn, camera).cpu().double().numpy()
+        return found
+
+
 class Orthophoto(NamedTuple):
     """A surface from far above; rows and columns run along its axes.
 
@@ -134,22 +179,19 @@ class Orthophoto(NamedTuple):
     covered: FloatArray
 
 
-def photographed(
-    gaussians: Gaussians, gone: Mask, surface: Surface, members: Mask, cameras: Sequence[Camera]
-) -> Orthophoto:
+def photographed(views: Views, gone: Mask, surface: Surface, members: Mask) -> Orthophoto:
     """An image of the surface under a thing from above, and what the views see of it.
 
     Args:
-        gaussians: The scene with the thing.
+        views: The scene with the thing; without any views, the surface is shown everywhere.
         gone: The Gaussians of the thing and of others that go with it ``[N]``.
         surface: The plane.
         members: The Gaussians that are drawn ``[N]``.
-        cameras: The views that the scene was made from; without any, the surface is shown everywhere.
     """
-    cells, size = _cells(surface, cameras)
-    colors, coverage, _ = from_above(gaussians, surface, members, cells)
+    cells, size = _cells(surface, views.of)
+    colors, coverage, _ = from_above(views.gaussians, surface, members, cells)
     places = (surface.origin + cells @ surface.axes[:2]).reshape(-1, 3)
-    shown, covered, seen = looked_up(gaussians, gone, places, cameras, THICK * surface.radius)
+    shown, covered, seen = looked_up(views, gone, places, THICK * surface.radius)
     shape = cells.shape[:2]
     shown, covered, seen = shown.reshape(shape), covered.reshape(shape), seen.reshape(colors.shape)
     known = (coverage > 0.5) & (shown > 0)
@@ -158,19 +200,18 @@ def photographed(
     if known.any():
         there, drawn = (mean_around(image, known.astype(float), width, 4.0) for image in (seen, colors))
         gain = (there / np.maximum(drawn, 0.02)).clip(0.5, 2)
-    return Orthophoto(cells, size, colors * gain, shown if cameras else np.ones_like(shown), covered)
+    return Orthophoto(cells, size, colors * gain, shown if views.of else np.ones_like(shown), covered)
 
 
 def looked_up(
-    gaussians: Gaussians, gone: Mask, places: FloatArray, cameras: Sequence[Camera], slack: float
+    views: Views, gone: Mask, places: FloatArray, slack: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Visibility and color of places ``[M, 3]`` in some of the views.
+    """Visibility and color of places ``[M, 3]`` in the views.
 
     Args:
-        gaussians: The scene.
+        views: The scene and its views.
         gone: The Gaussians of a thing ``[N]``.
         places: Points of the world.
-        cameras: The views.
         slack: Depth tolerance, world units: a surface up to this far before a place is taken for it.
 
     Returns:
@@ -179,13 +220,14 @@ def looked_up(
     """
     counts, shown, covered = (np.zeros(len(places)) for _ in range(3))
     colors = np.zeros((len(places), 3))
-    thing = torch.from_numpy(gone)[:, None].to(gaussians.means)
-    for camera in evenly(cameras, _VIEWS):
-        small = camera.within(_LONG_SIDE)
+    thing = torch.from_numpy(gone)[:, None].to(views.gaussians.means)
+    for number, camera in enumerate(views.small):
         with torch.no_grad():
-            view = render(gaussians, small, features=thing, depth=True)
+            view = render(
+                views.gaussians, camera, features=thing, depth=True, prepared=views.prepared(number)
+            )
         nearest = cast(torch.Tensor, view.depth).cpu().numpy()
-        found, depth, inside = small.project(places)
+        found, depth, inside = camera.project(places)
         here = np.flatnonzero(inside)
         pixels = tuple(found[here, ::-1].astype(int).T)
         there = nearest[pixels] > depth[here] - slack
@@ -198,12 +240,20 @@ def looked_up(
     return shown / np.maximum(counts, 1), covered / np.maximum(counts, 1), colors
 
 
-def seen_weights(gaussians: Gaussians, kept: Mask, cameras: Sequence[Camera]) -> FloatArray:
-    """Visible weights of some Gaussians, drawn without the others, in some of the views, in their pixels ``[N]``."""
-    drawn, weights = gaussians.select(torch.from_numpy(kept).to(gaussians.device)), np.zeros(len(kept))
-    for camera in evenly(cameras, _VIEWS):
-        weights[kept] += measure_weights(drawn, camera.within(_LONG_SIDE)).cpu().double().numpy()
-    return weights
+def covering(views: Views, gone: Mask, places: FloatArray) -> FloatArray:
+    """The share of the views that have a thing at a place or before it ``[M]``: the second of `looked_up`."""
+    counts, covered = np.zeros(len(places)), np.zeros(len(places))
+    thing = torch.from_numpy(gone)[:, None].to(views.gaussians.means)
+    for number, camera in enumerate(views.small):
+        with torch.no_grad():
+            view = render(
+                views.gaussians, camera, features=thing, color=False, prepared=views.prepared(number)
+            )
+        found, _, inside = camera.project(places)
+        here = np.flatnonzero(inside)
+        counts[here] += 1
+        covered[here] += view.features[..., 0].cpu().numpy()[tuple(found[here, ::-1].astype(int).T)] > _BEFORE
+    return covered / np.maximum(counts, 1)
 
 
 def from_above(
