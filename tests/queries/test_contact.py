@@ -77,14 +77,14 @@ def room(rng):
     }  # fmt: skip
 
 
-def selections(things, turn=None):
+def selections(things, turn=None, eye=(0.0, -6.0, 2.0)):
     points, labels = np.concatenate(list(things.values())), np.repeat(
         np.arange(len(things)), [len(cloud) for cloud in things.values()]
     )  # fmt: skip
     gaussians = gaussians_from_points(
         points if turn is None else points @ turn.T, np.full((len(points), 3), 0.5), sh_degree=0, opacity=0.8
     )
-    cameras = {"front": look_at([0.0, -6.0, 2.0], [0.0, 0.0, 0.0], UP, 64, 48, 0.8)}
+    cameras = {"front": look_at(eye, [0.0, 0.0, 0.0], UP, 64, 48, 0.8)}
     made = {}
     for number, name in enumerate(things):
         mask = torch.from_numpy(labels == number)
@@ -128,6 +128,25 @@ def test_what_stands_lies_or_hangs_on_something_is_on_it(things, first, second):
 @pytest.mark.parametrize(("first", "second"), NOT_ON)
 def test_what_is_beside_below_or_away_from_something_is_not_on_it(things, first, second):
     assert not holds("on", things[first], things[second], FRAME)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_thing_at_the_far_edge_of_a_table_stands_on_what_it_hides(seed):
+    rng = np.random.default_rng(seed)
+    made = selections(
+        {
+            "table": slab(rng, (-2, 2), (-1, 1), 0.0, 4000),  # what photos from the front show of it
+            "vase": block(rng, (0.2, 0.6), (0.97, 1.24), (0.0, 0.6), 600),
+            "post": block(
+                rng, (-0.9, -0.6), (1.02, 1.3), (-2.0, 0.5), 600
+            ),  # from the floor up, beside the table
+            "far": block(rng, (-1.6, -1.2), (1.4, 1.7), (0.0, 0.6), 600),
+            "floor": slab(rng, (-3, 3), (-2, 3), -2.0, 4000),
+        },
+        eye=(0.0, -6.0, 0.0),
+    )
+    on = [name for name in ("vase", "post", "far") if holds("on", made[name], made["table"], FRAME)]
+    assert on == ["vase"]
 
 
 @pytest.mark.parametrize(("first", "second"), UNDER)

@@ -54,6 +54,9 @@ def test_an_old_folder_says_how_to_get_segments(tmp_path, capsys):
         assert capsys.readouterr().out.endswith(f"in this scene\nno segments: {NO_SEGMENTS}\n")
         assert cli.main([*command, "--json"]) == 0
         json.loads(capsys.readouterr().out)
+    assert cli.main(["edit", folder, "delete", "--select", "red apple", "--yes"]) == 0
+    assert f"note: borders of things may stay behind, no segments: {NO_SEGMENTS}\n" in capsys.readouterr().err
+    assert cli.main(["edit", folder, "discard", "--yes"]) == 0
     assert cli.main(["query", folder, "red apple", "--no-images", "--form", "code"]) == 0
     assert "no segments" not in capsys.readouterr().out, "asked for"
     assert cli.main(["find", "demo", "red apple"]) == 0

@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from lexsplat.cli.options import PRESENCE, Device, SceneArgument, check_threshold, confirmed, open_scene
+from lexsplat.cli.options import (
+    PRESENCE,
+    Device,
+    SceneArgument,
+    check_threshold,
+    confirmed,
+    open_scene,
+    without_segments,
+)
 from lexsplat.cli.values import Color, Lengths, Reach, Shift
 from lexsplat.cli.waiting import starting
 from lexsplat.runtime.errors import QueryError
@@ -204,3 +212,5 @@ class Edit:
             why = "; ".join(filter(None, (PRESENCE[chosen.present or "yes"].lstrip("; "), chosen.note)))
             undo = f"lexsplat edit {quote(self.scene)} undo takes the step back"
             print(f"note: {self.select}: {why}; {undo}", file=sys.stderr)
+        if note := without_segments(editor.original):
+            print(f"note: borders of things may stay behind, {note}", file=sys.stderr)

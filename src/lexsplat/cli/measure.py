@@ -10,7 +10,15 @@ from typing import Annotated, Any
 
 import tyro
 
-from lexsplat.cli.options import PRESENCE, Device, SceneArgument, named, open_scene, print_json
+from lexsplat.cli.options import (
+    PRESENCE,
+    Device,
+    SceneArgument,
+    named,
+    open_scene,
+    print_json,
+    without_segments,
+)
 from lexsplat.cli.waiting import starting
 
 FirstArgument = Annotated[str, tyro.conf.Positional, named("FIRST")]
@@ -54,6 +62,8 @@ class Measure:
             print_json(document)
             return
         _print_lengths(document)
+        if note := without_segments(scene):
+            print(note)
         # The bundled scene is never written, so nobody can give it a scale.
         bundled = scene.folder is not None and scene.folder.is_bundled
         if document["meters_per_unit"] is None and not bundled:

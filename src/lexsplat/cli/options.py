@@ -102,10 +102,17 @@ def confirmed(question: str) -> bool:
 def print_rests_on(scene: Scene, rests_on: str) -> None:
     """Print what an answer rests on, and how to get segments where they are asked for and there are none."""
     print(f"relative to {rests_on}")
-    if scene.query.form == "segment" and scene.field.segments is None:
-        from lexsplat.scenes.facts import NO_SEGMENTS
+    if note := without_segments(scene):
+        print(note)
 
-        print(f"no segments: {NO_SEGMENTS}")
+
+def without_segments(scene: Scene) -> str:
+    """How to get segments where they are asked for and there are none; empty elsewhere."""
+    if scene.query.form != "segment" or scene.field.segments is not None:
+        return ""
+    from lexsplat.scenes.facts import NO_SEGMENTS
+
+    return f"no segments: {NO_SEGMENTS}"
 
 
 def print_json(document: Any) -> None:

@@ -33,6 +33,8 @@ _BEYOND = 0.04
 """On each side of the middle of the foot lies at least this share of the surface: the foot is not beside it."""
 _TAIL = 0.004
 """The same where the whole surface counts: fewer points than these are strays."""
+_BEHIND = 1.0
+"""A thing hides the surface behind it: it may stand this many of its radii beyond what is seen of a level one."""
 _LEVEL = 0.25
 """A level surface: most of it is at most this high, relative to the median distance from its middle."""
 _OVER = 0.3
@@ -129,7 +131,12 @@ def rests_on(target: Selection, support: Selection, up: NDArray[np.float64]) -> 
         return _attached(upper, lower, normal) and not _supported(target, support, up)
     if not _is_higher(upper, lower):
         return False
-    gap, height = _gap(upper, lower, body_of(support, up, _ALL_POINTS), overlap(target, support, _EDGE))
+    whole = body_of(support, up, _ALL_POINTS)
+    gap, height = _gap(upper, lower, whole, overlap(target, support, _EDGE))
+    if gap == np.inf and _stands_behind(upper, whole):
+        below = upper.span()[0] - whole.middle
+        filled = below > 0 and _filled(target, upper, below, up)
+        gap = below if filled or not _supported(target, support, up) else gap
     if gap <= _SUPPORT * height:
         return True
     if gap == np.inf:
@@ -197,6 +204,16 @@ def _gap(upper: Body, lower: Body, whole: Body, overlapping: bool) -> tuple[floa
     return float(gaps[np.abs(gaps).argmin()]), top - bottom
 
 
+def _stands_behind(upper: Body, surface: Body) -> bool:
+    """Whether a thing is just beyond what is seen of a level surface, such as at the far edge of a table."""
+    bottom, top = upper.span()
+    if not _is_level(surface) or bottom < surface.span(0.1)[0] - _SINK * (top - bottom):
+        return False
+    away = surface.center - upper.center
+    moved = upper.plan + away / max(float(np.linalg.norm(away)), 1e-9) * _BEHIND * upper.width
+    return _surrounds(surface, Body(moved, upper.heights), _TAIL)
+
+
 def _is_level(body: Body) -> bool:
     low, high = body.span(0.1)
     return high - low <= _LEVEL * body.width
@@ -255,7 +272,7 @@ def _attached(upper: Body, wall: Body, normal: NDArray[np.float64]) -> bool:
 
 
 def _supported(target: Selection, wall: Selection, up: NDArray[np.float64]) -> bool:
-    """Whether a thing at a wall stands on something else."""
+    """Whether a thing at a wall, or behind a surface, stands on something else."""
     body = body_of(target, up)
     bottom, top = body.span()
     others = target.gaussians.means.detach().cpu().numpy()[~(target.mask | wall.mask).cpu().numpy()]
