@@ -102,6 +102,43 @@ def test_a_place_alone_is_any_object_there_and_two_places_hold_for_one_thing(tex
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "TOYS on the table that are not on the cloth",
+        "TOYS on the table which aren't on the cloth",
+        "TOYS on the table not on the cloth",
+        "which TOYS on the table are not on the cloth?",
+        "how many TOYS on the table are not on the cloth?",
+        "TOY on the table that is not on the cloth",
+        "what is on the table that is not on the cloth",
+        "what on the table is not on the cloth?",
+        "is there anything on the table that isn't on the cloth?",
+    ],
+)
+def test_a_clause_behind_a_surface_is_said_of_the_things_on_it(text):
+    things = Related("on", TOY if "TOY" in text else ANY, TABLE)
+    assert understand(text.lower()) == Understood(Except(things, Related("on", things, CLOTH)))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("toys on the table that are next to the mug", Related("next to", Related("on", TOY, TABLE), MUG)),
+        ("toys on the table that are on the left", Pick("leftmost", Related("on", TOY, TABLE))),
+        ("largest toy on the table that is not on the cloth", parse("largest toy on the table not on the cloth")),
+        ("toy next to the mugs that is on the cloth", Related("on", Related("next to", TOY, MUG), CLOTH)),
+        ("toys next to the mugs that are on the cloth", Related("next to", TOY, ON_CLOTH)),
+        ("toy next to the mug that is on the cloth", Related("next to", TOY, ON_CLOTH)),
+        ("toy next to the mug that is not on the cloth", Related("next to", TOY, Except(MUG, ON_CLOTH))),
+        ("toy on the mug that is not on the cloth", Related("on", TOY, Except(MUG, ON_CLOTH))),
+        ("mug on the cloth and on the left", Pick("leftmost", ON_CLOTH)),
+    ],
+)  # fmt: skip
+def test_a_clause_is_said_of_what_its_verb_agrees_with_and_else_of_the_nearest_noun(text, expected):
+    assert understand(text) == Understood(expected)
+
+
+@pytest.mark.parametrize(
     ("text", "named"),
     [
         ("is the lamp on?", "on"),

@@ -4,6 +4,7 @@ mug                                  a thing; every word goes to the text encode
 mug on the cloth                     things by their place (`patterns.RELATIONS`)
 mug not on the cloth                 all other mugs
 mug next to the duck on the table    right-associative: mug next to (duck on the table)
+things on it that are not on the mat   by the verb, said of the things (`wording.of_the_first`)
 mug between the apple and the duck   also "closest to", "farthest from", "in the back left corner"
 toy in front of me                   "me" stands where the view was taken
 apple and banana                     the union; also "or" and commas
@@ -96,9 +97,12 @@ from lexsplat.queries.wording import (
     lacking,
     names_things,
     number,
+    of_the_first,
     own_words,
     picked,
+    relation_of,
     undetermined,
+    unhidden,
 )
 from lexsplat.runtime.errors import QueryError
 
@@ -148,16 +152,7 @@ def understand(text: str) -> Understood:
             moment,
         )
         note = in_own_letters("; ".join(filter(None, told)), plain)
-    return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note, unknown, unread)
-
-
-def _unhidden(thing: Thing, quoted: list[str]) -> Thing:
-    shown = patterns.HIDDEN.sub(lambda match: quoted[int(match[1])], thing.text).strip()
-    if not shown:
-        raise QueryError(
-            "phrase", expected="a thing in the quotation marks", found="nothing", remedy='such as "red mug"'
-        )
-    return replace(thing, text=shown, exact=shown != thing.text)
+    return Understood(with_things(parsed, lambda thing: unhidden(thing, quoted)), note, unknown, unread)
 
 
 class _Parser:
@@ -392,7 +387,7 @@ class _Parser:
 
     def related(self, words: str, found: re.Match[str], depth: int) -> Phrase | None:
         """Two phrases in a relation; None if the word of the relation belongs to a thing."""
-        relation = next(name for i, (_, name) in enumerate(patterns.RELATIONS) if found.group(f"r{i}"))
+        relation = relation_of(found)
         target, reference = words[: found.start()].strip(), words[found.end() :].strip()
         if not reference and (" to " in f" {target} "):  # "something to sit on" has no reference
             return None
@@ -402,6 +397,8 @@ class _Parser:
             raise IncompleteError(found[0].strip())
         if patterns.TO_A_SIDE.match(reference):
             return None  # mug on the left
+        if (split := of_the_first(relation, reference)) is not None:
+            return placed(self.phrase(split[1], depth), self.phrase(f"{target}{found[0]}{split[0]}", depth))
         things = self.phrase(target, depth) if target else Anything()
         related = Related(relation, things, self.phrase(reference, depth))
         return Except(things, related) if found.group("not") else related

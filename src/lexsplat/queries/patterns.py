@@ -41,6 +41,12 @@ RELATION = re.compile(
     + r")\s",
     re.IGNORECASE,
 )
+CLAUSE = re.compile(
+    r"^(?P<noun>.+?)\s(?:(?:(?:that|which|who)\s)?(?:(?P<one>is|was)|(?P<many>are|were))\s|(?=not\s))"
+    r"(?P<clause>(?P<not>not\s)?.+)$",
+    re.IGNORECASE,
+)
+"""A noun, and a clause behind it with the number of its verb, if it has one."""
 BETWEEN = re.compile(
     rf"^(.*?)\s{LINK}(not\s)?(?:in |halfway |midway )?between\s(.+?)\sand\s(.+)$", re.IGNORECASE
 )

@@ -293,7 +293,7 @@ def placed(place: Phrase, target: Phrase) -> Phrase:
     """A place of any object as the place of ``target``: "left of the mug" as "duck left of the mug"."""
     if isinstance(place, Anything):
         return target
-    if isinstance(place, (Related, Between, InCorner, InPart)):
+    if isinstance(place, (Related, Between, InCorner, InPart, Pick)):
         return replace(place, target=placed(place.target, target))
     if isinstance(place, (Both, Together)):
         return replace(place, first=placed(place.first, target), second=placed(place.second, target))

@@ -135,7 +135,7 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:what|who) (stands?|lies|lie|sits?|hangs?|rests?) ", r"thing that is \1 "),
     (r"what (\w+s) (?!(?:is|are|was|were)\b)(.+)$", r"something that \1 \2"),
     (r"(?:which|what) (.+?) (?:is|are)(?: (?:there|here|visible|present|shown))?$", r"\1"),
-    (r"(?:which|what) ([\w ]+?) (?:is|are) (?=\S)", r"\1 that is "),
+    (r"(?:which|what) ([\w ]+?) (is|are) (?=\S)", r"\1 that \2 "),
     (rf"(?:which|what) (?!(?:do|does|did|is|are|was|were|has|have|had|{_CAN})\b)(?=\w+ )", ""),
 )  # fmt: skip
 _COMPILED = tuple((re.compile("^" + pattern, re.IGNORECASE), instead) for pattern, instead in _FRAMES)
