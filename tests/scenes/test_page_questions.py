@@ -24,7 +24,7 @@ SINGLE = (
     'the "red apple" and the duck', "is there a zebra or a duck?", "is there a zebra and a duck?", "pink things",
     "red toy", "orange fruit", "yellow fruit", "blue toy", "something with leaves", "things with leaves",
     "can you see the mug?", "How many books?", "zebra", "red apple", "handle", "which things are toys?",
-    "is the plant dead?", "where is the duck standing?", "how many wheels does the car have?",
+    "is the plant dead?", "is the lamp still on?", "is the mug empty or full?", "which mug is clean?", "where is the duck standing?", "how many wheels does the car have?",
     "things that are animals", "green leaves", "yellow books", "leaves of the plant", "plant leaves", "lampshade",
     "white lampshade", "flowerpot", "teddybear", "cupboard", "what touches the cloth?", "loaves of bread",
     "is the apple far from the lamp?", "which object is the heaviest?", "apple touching the banana",

@@ -81,6 +81,7 @@ from lexsplat.queries.questions import (
     says_more,
     states,
     with_asking_words,
+    without_state,
 )
 from lexsplat.queries.rewording import in_full
 from lexsplat.queries.spelling import singular, straight_quotes
@@ -131,10 +132,10 @@ def understand(text: str) -> Understood:
     if not plain:
         raise QueryError("phrase", expected="words", found="nothing", remedy='such as "red mug"')
     mended_text, mended = with_asking_words(plain if plain[1:2].isupper() else plain[:1].lower() + plain[1:])
-    asked, moment = at_one_moment(in_full(mended_text))
+    whole, moment = at_one_moment(in_full(mended_text))
+    asked, state = without_state(whole)
     parser = _Parser(text, together=asks_yes_or_no(asked), stated=states(asked))
-    aside = not_in_answer(asked)
-    unknown, unread = aside.startswith('"'), False
+    unknown, unread = bool(state), False
     try:
         parsed = parser.whole_phrase(asked)
     except IncompleteError as incomplete:
@@ -148,7 +149,8 @@ def understand(text: str) -> Understood:
             mended_note(mended),
             *dict.fromkeys(parser.notes + parser.asides + unlooked),
             command_note(asked),
-            aside,
+            not_in_answer(asked),
+            state,
             moment,
         )
         note = in_own_letters("; ".join(filter(None, told)), plain)

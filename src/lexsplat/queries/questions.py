@@ -144,7 +144,17 @@ _LAST_QUALITIES = re.compile(
     rf"^(.+?) ({_ADJECTIVE}(?:(?:,? and |,? or |, ?| ){_ADJECTIVE})*)$", re.IGNORECASE
 )
 _ARTICLES = re.compile(r"^(?:(?:the|a|an|my|this|that|these|those|your|all|every|each|of) )+", re.IGNORECASE)
-_STATE = re.compile(rf"(?<! than)\b({'|'.join(sorted(STATES))})$", re.IGNORECASE)
+_ANY_STATE = (
+    rf"(?:(?:(?:switched|turned|plugged|powered) )?(?:on|off)|plugged in|(?:full of|filled with) \w+|working|running|"
+    rf"{'|'.join(sorted(STATES))})"
+)
+_STATE = re.compile(
+    rf"^(?:(?:is|are|was|were)(?: there)?|(?:which|what)(?! (?:is|are|was|were|do|does|did) )"
+    rf"(?=.* (?:is|are|was|were)(?: not)? {_ANY_STATE}\b)) (?P<thing>.+?)(?: (?:that|which))?(?: (?:is|are|was|were))?"
+    rf"(?: not)?(?<! than) (?P<state>{_ANY_STATE})(?:,? (?:and|or) (?:not|{_ANY_STATE}))*$",
+    re.IGNORECASE,
+)
+"""A question on the state of a thing: "is the lamp on?", "which mug is empty or full?"."""
 _COUNTED_TAIL = re.compile(
     rf"\s(?:(?:is|are|do|can|could|did|does|would)(?: {_I}| there)?(?: (?:see|find|count|have|spot|get|exist|visible|present|detect))?|exist)$",
     re.IGNORECASE,
@@ -259,8 +269,7 @@ def not_in_answer(words: str) -> str:
         return 'the answer is the thing: a material is asked for by its name, as in "mug made of metal"'
     if _HOW_LARGE.search(words):
         return 'the answer is the thing: "lexsplat find" and "lexsplat list" tell its size'
-    state = _STATE.search(words) if asks_yes_or_no(words) else None
-    return f'"{state[1]}" is asked as a word of the thing, which photos may not tell' if state else ""
+    return ""
 
 
 def command_note(words: str) -> str:
@@ -275,6 +284,14 @@ def at_one_moment(words: str) -> tuple[str, str]:
     if found is None:
         return words, ""
     return _MOMENT.sub("", words), f'"{found[1]}" is left out: a scene is one moment'
+
+
+def without_state(words: str) -> tuple[str, str]:
+    """The thing whose state is asked for, and a note on that; any other question as it is, and ""."""
+    found = _STATE.match(words)
+    if found is None:
+        return words, ""
+    return found["thing"], f'the answer is the thing: "{found["state"]}" is a state, which photos may not tell'
 
 
 def says_more(statement: str) -> str:
