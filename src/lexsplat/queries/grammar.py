@@ -83,7 +83,7 @@ from lexsplat.queries.questions import (
     with_asking_words,
     without_state,
 )
-from lexsplat.queries.rewording import in_full
+from lexsplat.queries.rewording import counts_parts, in_full
 from lexsplat.queries.spelling import singular, straight_quotes
 from lexsplat.queries.statements import neither, stated_of_two
 from lexsplat.queries.vocabulary import QUALITIES, SURFACES
@@ -154,7 +154,8 @@ def understand(text: str) -> Understood:
             moment,
         )
         note = in_own_letters("; ".join(filter(None, told)), plain)
-    return Understood(with_things(parsed, lambda thing: unhidden(thing, quoted)), note, unknown, unread)
+    shown = with_things(parsed, lambda thing: unhidden(thing, quoted))
+    return Understood(shown, note, unknown, unread, counts_parts(mended_text))
 
 
 class _Parser:
@@ -337,10 +338,10 @@ class _Parser:
         if quantity > 1 or rank or exact:
             asides = re.match(r"(?:from|to|on|at)\s", bare, re.IGNORECASE)
             target = self.phrase(f"thing {bare}" if asides else bare, depth)
-            ordered = numbered(target, max(quantity, 1), max(rank, 1))
-            return ordered or (
-                Thing(words) if rank else AtLeast(quantity, target, quantity if exact else None)
-            )
+            if ordered := numbered(target, max(quantity, 1), max(rank, 1)):
+                return ordered
+            most, is_definite = quantity if exact else None, bool(patterns.DEFINITE.match(words))
+            return Thing(words) if rank else AtLeast(quantity, target, most, is_definite)
         if found := patterns.SIZE.match(bare):
             return self.sized(bare, found, depth)
         place = self.place(bare, depth)

@@ -152,6 +152,7 @@ QUANTITY = re.compile(
     r"\s+(?!(?:meters?|metres?|centimeters?|inch(?:es)?|feet|yards?|steps?|cm|mm|m)\b)(?:of\s+)?",
     re.IGNORECASE,
 )
+DEFINITE = re.compile(r"^(?:the|these|those|my|our|your) ", re.IGNORECASE)
 AT_MOST = re.compile(
     r"^(?:(?P<below>(?:fewer|less) than)|at (?:the )?most|(?:no|not) more than|up to|(?:a )?maximum(?: of)?) "
     rf"(?P<number>\d{{1,3}}|{'|'.join(NUMBERS)})"
