@@ -340,8 +340,8 @@ class _Parser:
             target = self.phrase(f"thing {bare}" if asides else bare, depth)
             if ordered := numbered(target, max(quantity, 1), max(rank, 1)):
                 return ordered
-            most, is_definite = quantity if exact else None, bool(patterns.DEFINITE.match(words))
-            return Thing(words) if rank else AtLeast(quantity, target, most, is_definite)
+            limit, is_definite = quantity if exact else None, bool(patterns.DEFINITE.match(words))
+            return Thing(words) if rank else AtLeast(quantity, target, limit, is_definite)
         if found := patterns.SIZE.match(bare):
             return self.sized(bare, found, depth)
         place = self.place(bare, depth)
