@@ -102,9 +102,46 @@ def test_a_place_alone_is_any_object_there_and_two_places_hold_for_one_thing(tex
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "TOYS on the table that are not on the cloth",
+        "TOYS on the table which aren't on the cloth",
+        "TOYS on the table not on the cloth",
+        "which TOYS on the table are not on the cloth?",
+        "how many TOYS on the table are not on the cloth?",
+        "TOY on the table that is not on the cloth",
+        "what is on the table that is not on the cloth",
+        "what on the table is not on the cloth?",
+        "is there anything on the table that isn't on the cloth?",
+    ],
+)
+def test_a_clause_behind_a_surface_is_said_of_the_things_on_it(text):
+    things = Related("on", TOY if "TOY" in text else ANY, TABLE)
+    assert understand(text.lower()) == Understood(Except(things, Related("on", things, CLOTH)))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("toys on the table that are next to the mug", Related("next to", Related("on", TOY, TABLE), MUG)),
+        ("toys on the table that are on the left", Pick("leftmost", Related("on", TOY, TABLE))),
+        ("largest toy on the table that is not on the cloth", parse("largest toy on the table not on the cloth")),
+        ("toy next to the mugs that is on the cloth", Related("on", Related("next to", TOY, MUG), CLOTH)),
+        ("toys next to the mugs that are on the cloth", Related("next to", TOY, ON_CLOTH)),
+        ("toy next to the mug that is on the cloth", Related("next to", TOY, ON_CLOTH)),
+        ("toy next to the mug that is not on the cloth", Related("next to", TOY, Except(MUG, ON_CLOTH))),
+        ("toy on the mug that is not on the cloth", Related("on", TOY, Except(MUG, ON_CLOTH))),
+        ("mug on the cloth and on the left", Pick("leftmost", ON_CLOTH)),
+    ],
+)  # fmt: skip
+def test_a_clause_is_said_of_what_its_verb_agrees_with_and_else_of_the_nearest_noun(text, expected):
+    assert understand(text) == Understood(expected)
+
+
+@pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("is the lamp on?", "on"),
+        ("what is on?", "is"),
         ("mug on", "on"),
         ("mug and", "and"),
         ("and", "and"),
@@ -242,6 +279,12 @@ def test_what_people_say_around_a_thing_is_understood(text, expected):
         ("how tall is the mug", MUG, "size"),
         ("how big is the mug?", MUG, "size"),
         ("what is the height of the mug?", MUG, "size"),
+        ("what is the color of the mug?", MUG, "lexsplat list"),
+        ("how far is the mug from the lamp?", Both(MUG, LAMP), "lexsplat measure"),
+        ("how far apart are the mug and the lamp?", Both(MUG, LAMP), "lexsplat measure"),
+        ("what's the distance between the mug and the lamp?", Both(MUG, LAMP), "lexsplat measure"),
+        ("distance from the mug to the lamp", Both(MUG, LAMP), "lexsplat measure"),
+        ("where can I grasp the mug?", MUG, "mug handle"),
         ("move the mug to the left", Pick("leftmost", MUG), '"move"'),
         ("Go to the mug", MUG, '"Go"'),
         ("hey robot, bring me the mug", MUG, '"bring"'),
@@ -325,11 +368,34 @@ def test_a_statement_that_the_grammar_cannot_check_is_said(question, word):
     assert f'not understood ("{word}")' in understood.note
 
 
-@pytest.mark.parametrize("state", ["dead", "lit", "ripe", "heavy"])
-def test_a_state_that_photos_may_not_tell_is_asked_as_an_adjective_and_said(state):
-    found = understand(f"is the mug {state}?")
-    assert (found.phrase, found.unknown) == (Thing(f"{state} mug"), True)
-    assert "photos may not tell" in found.note
+@pytest.mark.parametrize(
+    ("text", "thing", "state"),
+    [
+        ("is the mug dead?", MUG, "dead"),
+        ("is the mug lit", MUG, "lit"),
+        ("is the mug not heavy?", MUG, "heavy"),
+        ("is the mug empty or full?", MUG, "empty"),
+        ("is the mug full of tea?", MUG, "full of tea"),
+        ("is the lamp on?", LAMP, "on"),
+        ("is the lamp still on?", LAMP, "on"),
+        ("isn't the lamp switched off?", LAMP, "switched off"),
+        ("is there a lamp that is on?", LAMP, "on"),
+        ("which lamp is on?", LAMP, "on"),
+        ("are the mugs closed?", MUG, "closed"),
+        ("is the mug on the cloth clean?", Related("on", MUG, CLOTH), "clean"),
+    ],
+)
+def test_the_state_of_a_thing_is_not_told_and_the_thing_is_the_answer(text, thing, state):
+    found = understand(text)
+    assert (found.phrase, found.unknown, found.unread) == (thing, True, False)
+    assert f'the answer is the thing: "{state}" is a state, which photos may not tell' in found.note
+
+
+@pytest.mark.parametrize(
+    "text", ["what is the mug standing on?", "is the mug on the table?", "which table is the mug on?"]
+)
+def test_what_a_thing_stands_on_is_no_state(text):
+    assert "state" not in understand(text).note
 
 
 def test_a_scene_is_one_moment():

@@ -240,7 +240,7 @@ def test_words_that_name_no_thing_are_reported_as_they_were_written_and_the_whol
     assert understood.unknown
 
 
-@pytest.mark.parametrize("text", ["what is the color of the mug?", "the last object on the left"])
+@pytest.mark.parametrize("text", ["the last object on the left"])
 def test_a_note_quotes_no_words_that_nobody_wrote(text):
     note = understand(text).note
     assert "not understood" in note

@@ -118,10 +118,8 @@ def test_neither_nor_leaves_out_both(text, expected):
     ("text", "told"),
     [
         ("is the apple far from the lamp?", "from"),
-        ("How far is the duck from the ring?", "How"),
+        ("How far is the duck from me?", "How"),
         ("which object is the heaviest?", "is"),
-        ("distance between the apple and the banana", "distance"),
-        ("distance from the mug to the duck", "distance from"),
         ("is the mug closer to the duck than the lamp?", "closer"),
         ("no entry sign", "no"),
         ("what touches the cloth?", "touches"),

@@ -65,7 +65,7 @@ def test_a_compound_word_is_none_of_what_is_here_because_of_its_parts(demo, word
 
 
 def test_what_is_not_understood_is_unsure_without_instances_and_says_so(demo):
-    answer = find_phrase(demo, "How far is the duck from the ring?")
+    answer = find_phrase(demo, "How far is the duck from me?")
     assert (answer["present"], answer["count"], answer["gaussians"]) == ("unsure", 0, 0)
     assert 'not understood ("How")' in answer["note"]
     assert sentence(answer).startswith("Unsure: nothing certain is found")
@@ -89,6 +89,19 @@ def test_statements_are_checked(demo, text, present, count):
 )  # fmt: skip
 def test_a_sentence_on_few_things_says_whether_it_is_so(demo, text, start):
     assert sentence(find_phrase(demo, text)).startswith(start)
+
+
+@pytest.mark.parametrize(
+    ("text", "present", "count", "told"),
+    [("the two yellow things", "yes", 3, "3 found, not 2"), ("two yellow things", "yes", 3, ""),
+     ("the thing with a handle", "unsure", 1, "the handle of the mug"), ("containers", "yes", 3, ""),
+     ("how many legs does the table have?", "unsure", 0, "may not show"),
+     ("how many handles does the mug have?", "yes", 1, ""), ("what is in the mug?", "no", 0, "no object is listed")],
+)  # fmt: skip
+def test_what_may_not_be_seen_or_counted_is_said(demo, text, present, count, told):
+    answer = find_phrase(demo, text)
+    assert (answer["present"], answer["count"]) == (present, count)
+    assert told in answer["note"]
 
 
 def test_a_library_compares_the_words_that_a_scene_may_hold_instead():

@@ -55,6 +55,18 @@ def test_python_is_told_what_the_command_line_is_told(demo, phrase, told):
     assert found.note == answer["note"] == found.to_dict()["note"]
 
 
+@pytest.mark.parametrize(
+    ("question", "thing"),
+    [("is the lamp on?", "table lamp"), ("is the mug empty?", "mug"), ("is the mug full?", "mug")],
+)
+def test_a_state_is_unsure_and_never_the_place_of_another_thing(demo, question, thing):
+    found = demo.find(question)
+    (one,) = found.instances
+    listed = next(each for each in demo.objects if each.phrase == thing)
+    assert found.present == "unsure"
+    assert int(listed.mask[one.indices].sum()) > 0.9 * len(listed)
+
+
 def test_the_same_phrase_in_other_words_has_a_note_of_its_own(demo):
     assert not demo.find("banana").note
     assert "typing error" in demo.find("bananna").note
@@ -62,7 +74,7 @@ def test_the_same_phrase_in_other_words_has_a_note_of_its_own(demo):
 
 
 def test_one_phrase_that_is_no_words_leaves_the_others_of_a_batch_answered(demo):
-    mug, nothing, place, duck = find_phrases(demo, ["mug", "...", "is the lamp on?", "duck"])["phrases"]
+    mug, nothing, place, duck = find_phrases(demo, ["mug", "...", "when was the lamp on?", "duck"])["phrases"]
     assert (mug["present"], duck["present"]) == ("yes", "yes")
     for answer in (nothing, place):
         assert answer["present"] != "yes"

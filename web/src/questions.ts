@@ -33,15 +33,16 @@ export function understood(text: string, grammar: Grammar): Question {
   let number = 0;
   const plain = text.replaceAll("\0", "").replace(/"[^"]*"/g, () => `\0${number++}\0`).replace(/\s+/g, " ").trim();
   const asked = grammar.inFull(plain.replace(/[?.!\s]+$/, "") || plain);
-  const yesOrNo = grammar.match("yes_or_no", asked) !== null;
-  const parser = new Parser(grammar, yesOrNo, plain);
-  const things = parser.whole(yesOrNo ? grammar.without("moment", asked) : asked);
+  const now = grammar.match("yes_or_no", asked) ? grammar.without("moment", asked) : asked;
+  const inState = grammar.match("state", now)?.groups;
+  const rest = inState?.thing ?? now;
+  const parser = new Parser(grammar, grammar.match("yes_or_no", rest) !== null, plain);
+  const things = parser.whole(rest);
   const shown = ({ text: hidden, color }: Thing): Thing => {
     const whole = hidden.replace(HIDDEN, (_, n: string) => quoted[Number(n)]).trim();
     return { text: whole, color, exact: whole !== hidden };
   };
-  const state = yesOrNo ? (grammar.find("state", asked)?.[1] ?? "") : "";
-  return { things: things.map(shown), together: parser.together, beyond: parser.beyond, left: parser.left, state };
+  return { things: things.map(shown), together: parser.together, beyond: parser.beyond, left: parser.left, state: inState?.state ?? "" };
 }
 
 /** The prompts of a text: one for each thing between commas, or one where the commas belong to a question. */

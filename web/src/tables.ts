@@ -62,7 +62,7 @@ export class Tables implements Source {
       answers.push(answer);
     }
     const answer = answers.length === 1 ? answers[0] : this.#united(answers, question, prompt, color);
-    return state ? doubtful(answer, `“${state}” is asked as a word of the thing, which photos may not tell`) : answer;
+    return state ? doubtful(answer, `the answer is the thing: “${state}” is a state, which photos may not tell`) : answer;
   }
 
   /** What asks for more than things is not answered; its things are offered. */

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from lexsplat.geometry.cameras import Camera
+from lexsplat.queries.having import part_of_any
 from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.phrases import (
     ORDERED,
@@ -89,6 +90,8 @@ def answer(phrase: Phrase, searched: Searched) -> Selection:
     if isinstance(phrase, Thing):
         members = () if phrase.exact else _members(phrase.text, searched)
         selected = searched.select(phrase.text)
+        if selected.present == "no" and not phrase.exact and (part := part_of_any(phrase.text)):
+            return _with_part(selected, searched.select(part), searched)
         return _joined(selected, members, present="yes") if members else apart(selected, searched)
     found = _ANSWERS[type(phrase)](phrase, searched)
     # An empty result is a "no", whatever the presence of the parts, unless none is asked for.
@@ -96,6 +99,11 @@ def answer(phrase: Phrase, searched: Searched) -> Selection:
     if (not found and not may_be_none) or found.present == "no":
         found = replace(found, mask=torch.zeros_like(found.mask), parts=(), present="no")
     return replace(found, phrase=str(phrase))
+
+
+def _asks_what_fills(phrase: Phrase) -> bool:
+    """Whether a phrase asks what is in something, which may be what no list of objects has: coffee."""
+    return isinstance(phrase, Related) and phrase.relation == "inside" and phrase.target == Anything()
 
 
 def _members(text: str, searched: Searched) -> tuple[Selection, ...]:
@@ -176,6 +184,9 @@ def _related(phrase: Related, searched: Searched) -> Selection:
         found = related(phrase.relation, targets, references, viewers.frame)
         if directed:
             found = _seen(replace(found, note=""), viewers.seen_from)
+        if not found and references.present != "no" and _asks_what_fills(phrase):
+            note = f"no object is listed inside {phrase.reference}; what else may fill it is not told"
+            return replace(_joined(found, ()), note=note)
     return replace(found, present=min(found.present, references.present, key=PRESENCES.index))
 
 
@@ -274,6 +285,15 @@ def _having(phrase: Having, searched: Searched) -> Selection:
     return replace(_joined(targets, kept, present), note=notes)
 
 
+def _with_part(selected: Selection, parts: Selection, searched: Searched) -> Selection:
+    """The objects that have a part, whatever their names, as sure as the part is; else what is selected."""
+    things, found = _things(searched), _certain(parts)
+    if not things or not found:
+        return selected
+    kept = tuple(things[number] for number in sorted(_owners(list(things), found)))
+    return replace(_joined(selected, kept, parts.present), note=parts.note)
+
+
 def _without_any(things: list[Selection], parts: list[Selection]) -> list[Selection]:
     """The things that have none of some parts."""
     having = _owners(things, parts)
@@ -316,7 +336,12 @@ def _at_least(phrase: AtLeast, searched: Searched) -> Selection:
     if phrase.count == 0:
         return _at_most(phrase, found)
     if phrase.count <= found.count <= (found.count if phrase.most is None else phrase.most):
-        return found
+        told = (
+            f"{found.count} found, not {phrase.count}"
+            if phrase.definite and found.count > phrase.count
+            else ""
+        )
+        return replace(found, note="; ".join(filter(None, (found.note, told))))
     return replace(_joined(found, ()), note=f"{found.count} found of {phrase.target}")
 
 

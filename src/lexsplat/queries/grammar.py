@@ -4,6 +4,7 @@ mug                                  a thing; every word goes to the text encode
 mug on the cloth                     things by their place (`patterns.RELATIONS`)
 mug not on the cloth                 all other mugs
 mug next to the duck on the table    right-associative: mug next to (duck on the table)
+things on it that are not on the mat   by the verb, said of the things (`wording.of_the_first`)
 mug between the apple and the duck   also "closest to", "farthest from", "in the back left corner"
 toy in front of me                   "me" stands where the view was taken
 apple and banana                     the union; also "or" and commas
@@ -80,8 +81,9 @@ from lexsplat.queries.questions import (
     says_more,
     states,
     with_asking_words,
+    without_state,
 )
-from lexsplat.queries.rewording import in_full
+from lexsplat.queries.rewording import counts_parts, in_full
 from lexsplat.queries.spelling import singular, straight_quotes
 from lexsplat.queries.statements import neither, stated_of_two
 from lexsplat.queries.vocabulary import QUALITIES, SURFACES
@@ -96,9 +98,12 @@ from lexsplat.queries.wording import (
     lacking,
     names_things,
     number,
+    of_the_first,
     own_words,
     picked,
+    relation_of,
     undetermined,
+    unhidden,
 )
 from lexsplat.runtime.errors import QueryError
 
@@ -127,10 +132,10 @@ def understand(text: str) -> Understood:
     if not plain:
         raise QueryError("phrase", expected="words", found="nothing", remedy='such as "red mug"')
     mended_text, mended = with_asking_words(plain if plain[1:2].isupper() else plain[:1].lower() + plain[1:])
-    asked, moment = at_one_moment(in_full(mended_text))
+    whole, moment = at_one_moment(in_full(mended_text))
+    asked, state = without_state(whole)
     parser = _Parser(text, together=asks_yes_or_no(asked), stated=states(asked))
-    aside = not_in_answer(asked)
-    unknown, unread = aside.startswith('"'), False
+    unknown, unread = bool(state), False
     try:
         parsed = parser.whole_phrase(asked)
     except IncompleteError as incomplete:
@@ -144,20 +149,13 @@ def understand(text: str) -> Understood:
             mended_note(mended),
             *dict.fromkeys(parser.notes + parser.asides + unlooked),
             command_note(asked),
-            aside,
+            not_in_answer(asked),
+            state,
             moment,
         )
         note = in_own_letters("; ".join(filter(None, told)), plain)
-    return Understood(with_things(parsed, lambda thing: _unhidden(thing, quoted)), note, unknown, unread)
-
-
-def _unhidden(thing: Thing, quoted: list[str]) -> Thing:
-    shown = patterns.HIDDEN.sub(lambda match: quoted[int(match[1])], thing.text).strip()
-    if not shown:
-        raise QueryError(
-            "phrase", expected="a thing in the quotation marks", found="nothing", remedy='such as "red mug"'
-        )
-    return replace(thing, text=shown, exact=shown != thing.text)
+    shown = with_things(parsed, lambda thing: unhidden(thing, quoted))
+    return Understood(shown, note, unknown, unread, counts_parts(mended_text))
 
 
 class _Parser:
@@ -340,10 +338,10 @@ class _Parser:
         if quantity > 1 or rank or exact:
             asides = re.match(r"(?:from|to|on|at)\s", bare, re.IGNORECASE)
             target = self.phrase(f"thing {bare}" if asides else bare, depth)
-            ordered = numbered(target, max(quantity, 1), max(rank, 1))
-            return ordered or (
-                Thing(words) if rank else AtLeast(quantity, target, quantity if exact else None)
-            )
+            if ordered := numbered(target, max(quantity, 1), max(rank, 1)):
+                return ordered
+            limit, is_definite = quantity if exact else None, bool(patterns.DEFINITE.match(words))
+            return Thing(words) if rank else AtLeast(quantity, target, limit, is_definite)
         if found := patterns.SIZE.match(bare):
             return self.sized(bare, found, depth)
         place = self.place(bare, depth)
@@ -392,7 +390,7 @@ class _Parser:
 
     def related(self, words: str, found: re.Match[str], depth: int) -> Phrase | None:
         """Two phrases in a relation; None if the word of the relation belongs to a thing."""
-        relation = next(name for i, (_, name) in enumerate(patterns.RELATIONS) if found.group(f"r{i}"))
+        relation = relation_of(found)
         target, reference = words[: found.start()].strip(), words[found.end() :].strip()
         if not reference and (" to " in f" {target} "):  # "something to sit on" has no reference
             return None
@@ -402,6 +400,8 @@ class _Parser:
             raise IncompleteError(found[0].strip())
         if patterns.TO_A_SIDE.match(reference):
             return None  # mug on the left
+        if (split := of_the_first(relation, reference)) is not None:
+            return placed(self.phrase(split[1], depth), self.phrase(f"{target}{found[0]}{split[0]}", depth))
         things = self.phrase(target, depth) if target else Anything()
         related = Related(relation, things, self.phrase(reference, depth))
         return Except(things, related) if found.group("not") else related

@@ -21,6 +21,7 @@ _HAS = r"(?:with|having|(?:that|which|who) (?:has|have)|(?:has|have)(?= an?\b))"
 _THING = r"(?!(?:something|things?|objects?|items?|everything|anything|what|all)\b)(.*?\S)"
 WITH_PART = re.compile(rf"^{_THING}\s{_HAS}\s(?:(?:an?|the|its|some)\s)?({_PARTS})$", re.IGNORECASE)
 """A thing with a part."""
+_PART_OF_ANY = re.compile(rf"^something {_HAS} (?:(?:an?|the|its|some) )?({_PARTS})$", re.IGNORECASE)
 _NUMBER = rf"(?:no|\d+|{'|'.join(NUMBERS)})\b"
 WITH = re.compile(rf"^{_THING}\s(with\s(?!{_NUMBER})[^\x00]+)$", re.IGNORECASE)
 """A thing with another attribute; a number of parts is a fixed noun phrase: "table with four legs"."""
@@ -31,6 +32,12 @@ WITHOUT = re.compile(r"\swithout\s(?!(?:the|a|an|any|my|this|that)\s)", re.IGNOR
 def thing_of(text: str, own: str = "") -> Phrase:
     """A thing by its words (`lexsplat.queries.wording.thing_of`); "mug with a handle" is the mug that has one."""
     return _having(text) or wording.thing_of(text, own)
+
+
+def part_of_any(text: str) -> str:
+    """The part that things of any name have, in the singular: "handle" of "something with a handle"; "" if none."""
+    found = _PART_OF_ANY.match(text)
+    return singular(found[1]) if found else ""
 
 
 def unseen(phrase: Phrase, text: str) -> list[str]:

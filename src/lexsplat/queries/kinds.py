@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from lexsplat.queries.phrases import Phrase, Understood, things_of
 from lexsplat.queries.spelling import strange
-from lexsplat.queries.vocabulary import PARTS, QUALITIES, default_vocabulary, words
+from lexsplat.queries.vocabulary import PARTS, QUALITIES, SURFACES, default_vocabulary, words
 
 _MEMBERS = {
     "toy": "teddy bear, rubber duck, stuffed animal, doll, ball",
@@ -20,12 +20,31 @@ _MEMBERS = {
     "food": "apple, banana, orange, lemon, pear, bread, cake, cookie, cheese, egg, pumpkin",
     "clothes": "shoe, hat, shirt, glove",
     "instrument": "drum, guitar, piano",
+    "container": "mug, cup, glass, bottle, bowl, vase, pot, teapot, jar, jug, box, basket, bag, backpack, "
+    "bucket, crate, can, pan",
+    "tableware": "mug, cup, glass, bottle, bowl, plate, teapot, jug, spoon, fork, knife",
+    "electronics": "lamp, phone, camera, laptop, computer, computer keyboard, computer mouse, screen, "
+    "headphones, cable",
+    "portable": "",
 }
+_LARGE = """
+    tree, bush, chair, sofa, bench, cabinet, bicycle, car, person, statue, piano
+"""
+"""Everyday things that nobody picks up, in addition to surfaces."""
 _SAME = {
     "something to eat": "food", "thing to eat": "food", "edible thing": "food", "pet": "animal",
-    "clothing": "clothes", "musical instrument": "instrument", "plaything": "toy",
+    "clothing": "clothes", "musical instrument": "instrument", "plaything": "toy", "vessel": "container",
+    "receptacle": "container", "crockery": "tableware", "kitchenware": "tableware", "dish": "tableware",
+    "device": "electronics", "electronic device": "electronics", "electrical device": "electronics",
+    "appliance": "electronics", "electrical appliance": "electronics", "gadget": "electronics",
+    "something electronic": "electronics", "something electrical": "electronics",
+    "something portable": "portable", "something graspable": "portable",
+    **{f"something to {verb}": "portable" for verb in ("pick up", "grasp", "grab", "hold", "lift", "carry")},
 }  # fmt: skip
 KINDS = {kind: frozenset(words(members)) for kind, members in _MEMBERS.items()}
+KINDS["portable"] = (
+    frozenset(default_vocabulary() + default_vocabulary("bundled")) - SURFACES - {*words(_LARGE)}
+)
 KIND_PHRASES = (*_MEMBERS, *_SAME)
 """Every text that names a kind."""
 _LONG = 5

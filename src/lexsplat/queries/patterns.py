@@ -41,6 +41,12 @@ RELATION = re.compile(
     + r")\s",
     re.IGNORECASE,
 )
+CLAUSE = re.compile(
+    r"^(?P<noun>.+?)\s(?:(?:(?:that|which|who)\s)?(?:(?P<one>is|was)|(?P<many>are|were))\s|(?=not\s))"
+    r"(?P<clause>(?P<not>not\s)?.+)$",
+    re.IGNORECASE,
+)
+"""A noun, and a clause behind it with the number of its verb, if it has one."""
 BETWEEN = re.compile(
     rf"^(.*?)\s{LINK}(not\s)?(?:in |halfway |midway )?between\s(.+?)\sand\s(.+)$", re.IGNORECASE
 )
@@ -146,6 +152,7 @@ QUANTITY = re.compile(
     r"\s+(?!(?:meters?|metres?|centimeters?|inch(?:es)?|feet|yards?|steps?|cm|mm|m)\b)(?:of\s+)?",
     re.IGNORECASE,
 )
+DEFINITE = re.compile(r"^(?:the|these|those|my|our|your) ", re.IGNORECASE)
 AT_MOST = re.compile(
     r"^(?:(?P<below>(?:fewer|less) than)|at (?:the )?most|(?:no|not) more than|up to|(?:a )?maximum(?: of)?) "
     rf"(?P<number>\d{{1,3}}|{'|'.join(NUMBERS)})"

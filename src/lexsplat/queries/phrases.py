@@ -194,16 +194,20 @@ class Pick:
 class AtLeast:
     """All instances of ``target`` if there are at least ``count``, and at most ``most`` if given; otherwise none.
 
-    A ``count`` of 0 holds without any: "no mugs", "at most two mugs".
+    A ``count`` of 0 holds without any: "no mugs", "at most two mugs". A ``definite`` count, "the two mugs", should be
+    all that there are.
     """
 
     count: int
     target: Phrase
     most: int | None = None
+    definite: bool = field(default=False, compare=False)
 
     def __str__(self) -> str:
         if self.count == 0:
             return f"(at most {self.most} {self.target})" if self.most else f"(no {self.target})"
+        if self.definite:
+            return f"(the {self.count} {self.target})"
         return f"({'at least' if self.most is None else 'exactly'} {self.count} {self.target})"
 
 
@@ -246,16 +250,18 @@ class Understood:
         note: Remark on parts not understood; "" if there are none.
         unknown: Whether nothing is certainly here: it holds words that the encoder does not know, or has no grammar.
         unread: Whether it has no grammar: then nothing is certainly absent either.
+        may_hide: Whether it asks for what photos may not show, such as the legs of a table: then nothing is absent.
     """
 
     phrase: Phrase
     note: str = ""
     unknown: bool = False
     unread: bool = False
+    may_hide: bool = field(default=False, compare=False)
 
     def limit(self, present: Presence) -> Presence:
         """The presence of its answer: "unsure" at most where nothing is certainly here, and at least where unread."""
-        if self.unread:
+        if self.unread or (self.may_hide and present == "no"):
             return "unsure"
         return "unsure" if self.unknown and present == "yes" else present
 
@@ -293,7 +299,7 @@ def placed(place: Phrase, target: Phrase) -> Phrase:
     """A place of any object as the place of ``target``: "left of the mug" as "duck left of the mug"."""
     if isinstance(place, Anything):
         return target
-    if isinstance(place, (Related, Between, InCorner, InPart)):
+    if isinstance(place, (Related, Between, InCorner, InPart, Pick)):
         return replace(place, target=placed(place.target, target))
     if isinstance(place, (Both, Together)):
         return replace(place, first=placed(place.first, target), second=placed(place.second, target))

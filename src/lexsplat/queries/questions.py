@@ -32,6 +32,7 @@ _PLACE = (
     r"between|beside|besides|around|alongside|next to|close to|(?:left|right|top|front) of|to the|"
     r"(?:the )?(?:nearest|closest|farthest|furthest)) (?=\S))"
 )
+_GRASP = r"(?:grasp|grab|grip|hold|lift|take|pick up)"
 _SEE = r"(?:see|find|spot|detect|have|notice|recognize)"
 _LEAVE = (
     r"(?:leave|left|put|place|placed|keep|kept|store|stored|drop|dropped|lose|lost|forget|forgot|forgotten|"
@@ -79,6 +80,7 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (rf"{_REQUEST} (?=\S)", ""),
     (r"(?:whether|if) (?=there|the|a|an|any)", ""),
     # Where
+    (rf"(?:where|how) {_CAN} {_I} {_GRASP} (?=(?:the|a|an|my|this|that)\b)", ""),
     (r"where (?:is it|are they)[\s,]+", ""),
     (rf"where(?: else| exactly)? {_CAN} {_I} (?:find|see|get|spot|look for|buy|locate)\s+", ""),
     (rf"where (?:did|have|has|had) {_I} (?:ever |last )?(?:{_LEAVE}|have)\s+", ""),
@@ -92,7 +94,12 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:what (?:is|are) )?(?:the )?(?:locations?|positions?|names?|whereabouts|coordinates|poses?|place|sizes?|heights?|widths?|lengths?|dimensions) of ", ""),
     (r"in which (?:place|corner|spot) (?:is|are) ", ""),
     (r"(?:which|what) (?:place|corner|spot) (?:is|are) (.+?) in$", r"\1"),
-    # How many, how large
+    # How many, how large, how far, in which color
+    (r"how far (?:away |apart )?(?:is|are) (.+?) (?:away )?(?:from|to) (?!me$|us$|here$)(.+)$", r"\1 and \2"),
+    (r"how far apart (?:is|are) (?=.+ and )", ""),
+    (r"(?:what (?:is|are) )?(?:the )?distances? (?:between (.+?) and|(?:from|of) (.+?) (?:to|from)) (?!me$|us$|here$)(.+)$", r"\1\2 and \3"),
+    (r"(?:what (?:is|are) )?(?:the )?colou?rs? of ", ""),
+    (r"(?:what|which) colou?rs? (?:does|do) (.+?) have$", r"\1"),
     (r"how (?:big|large|small|tall|short|high|low|wide|long|deep|thick) (?:is|are) (?!.*\bthan\b)", ""),
     (rf"how (?:many|much)(?: of)?(?: the)? ([\w ]+?) (?:is|are) ((?:not )?(?:{'|'.join(sorted(QUALITIES))}))$", r"\1 that are \2"),
     (r"how (?:many|much)(?: of)?(?: the)? (?:different )?", ""),
@@ -135,7 +142,7 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:what|who) (stands?|lies|lie|sits?|hangs?|rests?) ", r"thing that is \1 "),
     (r"what (\w+s) (?!(?:is|are|was|were)\b)(.+)$", r"something that \1 \2"),
     (r"(?:which|what) (.+?) (?:is|are)(?: (?:there|here|visible|present|shown))?$", r"\1"),
-    (r"(?:which|what) ([\w ]+?) (?:is|are) (?=\S)", r"\1 that is "),
+    (r"(?:which|what) ([\w ]+?) (is|are) (?=\S)", r"\1 that \2 "),
     (rf"(?:which|what) (?!(?:do|does|did|is|are|was|were|has|have|had|{_CAN})\b)(?=\w+ )", ""),
 )  # fmt: skip
 _COMPILED = tuple((re.compile("^" + pattern, re.IGNORECASE), instead) for pattern, instead in _FRAMES)
@@ -144,7 +151,17 @@ _LAST_QUALITIES = re.compile(
     rf"^(.+?) ({_ADJECTIVE}(?:(?:,? and |,? or |, ?| ){_ADJECTIVE})*)$", re.IGNORECASE
 )
 _ARTICLES = re.compile(r"^(?:(?:the|a|an|my|this|that|these|those|your|all|every|each|of) )+", re.IGNORECASE)
-_STATE = re.compile(rf"(?<! than)\b({'|'.join(sorted(STATES))})$", re.IGNORECASE)
+_ANY_STATE = (
+    rf"(?:(?:(?:switched|turned|plugged|powered) )?(?:on|off)|plugged in|(?:full of|filled with) \w+|working|running|"
+    rf"{'|'.join(sorted(STATES))})"
+)
+_STATE = re.compile(
+    rf"^(?:(?:is|are|was|were)(?: there)?|(?:which|what)(?! (?:is|are|was|were|do|does|did) )"
+    rf"(?=.* (?:is|are|was|were)(?: not)? {_ANY_STATE}\b)) (?P<thing>.+?)(?: (?:that|which))?(?: (?:is|are|was|were))?"
+    rf"(?: not)?(?<! than) (?P<state>{_ANY_STATE})(?:,? (?:and|or) (?:not|{_ANY_STATE}))*$",
+    re.IGNORECASE,
+)
+"""A question on the state of a thing: "is the lamp on?", "which mug is empty or full?"."""
 _COUNTED_TAIL = re.compile(
     rf"\s(?:(?:is|are|do|can|could|did|does|would)(?: {_I}| there)?(?: (?:see|find|count|have|spot|get|exist|visible|present|detect))?|exist)$",
     re.IGNORECASE,
@@ -162,6 +179,14 @@ _LEFT_OVER = re.compile(
 _HOW_LARGE = re.compile(
     r"^(?:.*\b)?how (?:big|large|small|tall|short|high|low|wide|long|deep|thick) (?:is|are) (?!.*\bthan\b)|"
     r"\b(?:sizes?|heights?|widths?|lengths?|dimensions) of\b",
+    re.IGNORECASE,
+)
+_HOW_FAR = re.compile(
+    r"^how far\b|^(?:what (?:is|are) )?(?:the )?distances? (?:between|from|of)\b", re.IGNORECASE
+)
+_HOW_TO_GRASP = re.compile(rf"^(?:where|how) {_CAN} {_I} {_GRASP}\b", re.IGNORECASE)
+_WHICH_COLOR = re.compile(
+    r"^(?:of )?(?:what|which) colou?rs?\b.*\b(?:is|are|has|have)\b|^(?:what (?:is|are) )?(?:the )?colou?rs? of\b",
     re.IGNORECASE,
 )
 _YES_OR_NO = re.compile(
@@ -253,14 +278,17 @@ def asks_yes_or_no(words: str) -> bool:
 
 def not_in_answer(words: str) -> str:
     """A note on what a question asks for in addition to a thing and its place; "" if nothing."""
-    if re.match(r"(?:of )?(?:what|which) colou?rs?\b.*\b(?:is|are|has|have)\b", words, re.IGNORECASE):
+    if _WHICH_COLOR.match(words):
         return 'the answer is the thing: "lexsplat list" tells colors'
     if re.match(r"what (?:is|are) .+ made (?:out )?(?:of|from)$", words, re.IGNORECASE):
         return 'the answer is the thing: a material is asked for by its name, as in "mug made of metal"'
     if _HOW_LARGE.search(words):
         return 'the answer is the thing: "lexsplat find" and "lexsplat list" tell its size'
-    state = _STATE.search(words) if asks_yes_or_no(words) else None
-    return f'"{state[1]}" is asked as a word of the thing, which photos may not tell' if state else ""
+    if _HOW_FAR.match(words):
+        return 'the answer is the things: "lexsplat measure" tells how far apart two are'
+    if _HOW_TO_GRASP.match(words):
+        return 'the answer is the thing: a part is asked for by its name, as in "mug handle"'
+    return ""
 
 
 def command_note(words: str) -> str:
@@ -275,6 +303,16 @@ def at_one_moment(words: str) -> tuple[str, str]:
     if found is None:
         return words, ""
     return _MOMENT.sub("", words), f'"{found[1]}" is left out: a scene is one moment'
+
+
+def without_state(words: str) -> tuple[str, str]:
+    """The thing whose state is asked for, and a note on that; any other question as it is, and ""."""
+    found = _STATE.match(words)
+    if found is None:
+        return words, ""
+    return found[
+        "thing"
+    ], f'the answer is the thing: "{found["state"]}" is a state, which photos may not tell'
 
 
 def says_more(statement: str) -> str:

@@ -147,6 +147,11 @@ REWORDED = (
 )
 
 
+def counts_parts(words: str) -> bool:
+    """Whether a question asks how many parts a thing has, some of which photos may not show."""
+    return _HAS_PARTS.match(words) is not None
+
+
 def in_full(words: str) -> str:
     """Words without contractions, "what is" for "what's", and a question without its "not".
 

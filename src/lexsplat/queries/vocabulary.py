@@ -26,9 +26,9 @@ _QUALITIES = """
     big, small, large, little, tall, dark, bright, transparent, colorful
 """
 _STATES = """
-    open, closed, empty, full, broken, wet, dry, dirty, clean, old, new, dead, alive, lit, ripe, unripe, rotten,
-    fresh, hot, cold, warm, heavy, cute, happy, sad, expensive, cheap, real, fake, edible, fragile, rusty, dusty,
-    asleep, awake, frozen, melted, dangerous, comfortable, useful
+    open, closed, shut, locked, empty, full, broken, wet, dry, dirty, clean, old, new, dead, alive, lit, ripe, unripe,
+    rotten, fresh, hot, cold, warm, heavy, cute, happy, sad, expensive, cheap, real, fake, edible, fragile, rusty,
+    dusty, asleep, awake, frozen, melted, dangerous, comfortable, useful
 """
 _PARTS = """
     handle, lid, cap, spout, neck, rim, knob, stem, stalk, leaf, petal, shade, cord, string, flame, wick, cork,

@@ -22,10 +22,13 @@ from lexsplat.queries.phrases import (
     Pick,
     PickName,
     Related,
+    RelationName,
     Thing,
     Together,
 )
-from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, is_part_alone
+from lexsplat.queries.spelling import singular
+from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, SURFACES, is_part_alone
+from lexsplat.runtime.errors import QueryError
 
 
 class IncompleteError(Exception):
@@ -75,6 +78,50 @@ def thing_of(text: str, own: str = "") -> Phrase:
     if color in COLOR_WORDS and (target == "something" or is_kind(target)):
         return Colored(color, Anything() if target == "something" else Thing(target))
     return Thing(text, own="" if own == text else own)
+
+
+def unhidden(thing: Thing, quoted: list[str]) -> Thing:
+    """A thing with the words of its quoted parts.
+
+    Raises:
+        QueryError: If there is nothing in the quotation marks.
+    """
+    shown = patterns.HIDDEN.sub(lambda match: quoted[int(match[1])], thing.text).strip()
+    if not shown:
+        raise QueryError(
+            "phrase", expected="a thing in the quotation marks", found="nothing", remedy='such as "red mug"'
+        )
+    return replace(thing, text=shown, exact=shown != thing.text)
+
+
+def of_the_first(relation: RelationName, reference: str) -> tuple[str, str] | None:
+    """What things are related to, and a place behind it that is said of them; None if there is none.
+
+    "Things on the table that are not on the cloth": the table is one, so what "are" is the things. Where the verb
+    tells nothing, as in "fruit on the table that is not on the cloth", a second "on" that is denied is of the fruit:
+    the table is a surface, of which a scene has few. Any other place is of the nearest noun, as in "mug next to the
+    duck on the table".
+
+    Args:
+        relation: The relation of the things to the reference.
+        reference: The words of the reference, with what is behind it.
+    """
+    found = patterns.CLAUSE.match(reference)
+    if found is None or not is_place(found["clause"]):
+        return None
+    noun = undetermined(found["noun"])
+    several = singular(noun) != noun
+    disagrees = bool(found["one"] if several else found["many"])
+    second = patterns.RELATION.match(f" {found['clause']} ")
+    on_neither = bool(found["not"]) and second is not None and relation_of(second) == relation == "on"
+    if disagrees or (on_neither and singular(noun.lower()).split()[-1] in SURFACES):
+        return found["noun"], found["clause"]
+    return None
+
+
+def relation_of(found: re.Match[str]) -> RelationName:
+    """The relation of a match of `patterns.RELATION`."""
+    return next(name for i, (_, name) in enumerate(patterns.RELATIONS) if found.group(f"r{i}"))
 
 
 def undetermined(words: str) -> str:

@@ -59,7 +59,7 @@ def understood_in(scene: Scene, phrase: str) -> Understood:
 
     found = with_things(understood.phrase, mend)
     note = "; ".join(filter(None, (understood.note, mended_note(mended), *otherwise)))
-    return with_unknown_words(Understood(found, note), scene.clip)
+    return with_unknown_words(replace(understood, phrase=found, note=note), scene.clip)
 
 
 def _tokens_over(scene: Scene, text: str) -> int:
@@ -102,7 +102,8 @@ def find_in(
     if found.present == "no" and threshold is None:
         found = replace(found, mask=torch.zeros_like(found.mask), parts=())
     if (present := understood.limit(found.present)) != found.present:
-        found = found.described(present=present)
+        note = "photos may not show each part" if understood.may_hide and found.present == "no" else ""
+        found = found.described(present=present, note="; ".join(filter(None, (found.note, note))))
     low = _too_low(answers, threshold) if answers is not None and threshold is not None else ()
     return found.described(note="; ".join(filter(None, (understood.note, found.note, *low))))
 
