@@ -52,7 +52,7 @@ NEVER = (
 SURFACE_KINDS = ("table", "cloth", "wall", "floor")
 MODELED = ("handle", "nose", "belly", "ear", "flame", "wheel", "stalk", "beak", "shade", "cork")
 """Parts that things of tools/demo_scene have, of those that `lexsplat.queries.vocabulary` knows as parts."""
-NAMES_ASKED = 300
+NAMES_ASKED, DRAWS = 300, 10
 COLORS = ("red", "green", "blue", "yellow", "white", "brown", "pink", "purple", "orange")
 
 
@@ -192,18 +192,34 @@ def accuracy(folder: Path, ground_truth: Path, stride: int) -> dict:
 
 
 def inventory(folder: Path, ground_truth: Path, stride: int) -> dict:
-    """Things that `Scene.objects` finds under a right name with an IoU of Gaussians of at least .5.
+    """What `Scene.objects` finds with each of `DRAWS` vocabularies: its things, and its false names.
 
-    The names are the bundled ones and everyday words drawn with a seed, `NAMES_ASKED` together. A name is right if it
-    ends with the last word of the thing's kind or alias. Gaussians are weighted by what the views show of them.
+    The names are the bundled ones and everyday words drawn with a seed, `NAMES_ASKED` together. Rivals such as
+    "squash" for a pumpkin are drawn or not.
     """
     scene = lexsplat.open_scene(folder)
     lifted = lift_labels(scene.gaussians, load_ground_truth(ground_truth, stride), 256)
+    things = json.loads((ground_truth / "things.json").read_text())
     known = default_vocabulary("bundled")
-    drawn = random.Random(0).sample(sorted(set(everyday_words()) - set(known)), NAMES_ASKED - len(known))
-    objects = objects_of(scene, known + drawn)
+    others = sorted(set(everyday_words()) - set(known))
+    drawn = [random.Random(seed).sample(others, NAMES_ASKED - len(known)) for seed in range(DRAWS)]
+    rows = [named_things(objects_of(scene, known + words), things, lifted) for words in drawn]
+    found, false = ([row[name] for row in rows] for name in ("found", "false"))
+    return {
+        "found": f"{min(found)} to {max(found)}, mean {np.mean(found):.1f}, of {rows[0]['things']}",
+        "false": f"{min(false)} to {max(false)}, mean {np.mean(false):.1f}",
+        "draws": rows,
+    }
+
+
+def named_things(objects, things: dict, lifted) -> dict:
+    """Things that objects have under a right name with an IoU of Gaussians of at least .5, and objects that are none.
+
+    A name is right if it ends with the last word of the thing's kind or alias. Gaussians are weighted by what the
+    views show of them.
+    """
     numbers, best, used = lifted.labels // 10, {}, set()
-    for number, thing in json.loads((ground_truth / "things.json").read_text()).items():
+    for number, thing in things.items():
         wanted, kind = (numbers == int(number)) & (lifted.labels > 0), thing["kind"]
         right = {ALIASES.get(kind, kind).split()[-1].removesuffix("s"), kind.removesuffix("s")}
         if kind == "cloth":
@@ -216,14 +232,14 @@ def inventory(folder: Path, ground_truth: Path, stride: int) -> dict:
         iou, place = max(ious, default=(0.0, -1))
         best[f"{thing['color']} {kind}"] = round(iou, 3)
         used |= {place} if iou >= 0.5 else set()
-    things = {name: iou for name, iou in best.items() if name.split()[-1] not in SURFACE_KINDS}
+    wanted = {name: iou for name, iou in best.items() if name.split()[-1] not in SURFACE_KINDS}
     false = [
         each.phrase
         for place, each in enumerate(objects)
         if place not in used and each.phrase not in SURFACES | STUFF
     ]
-    found = sum(iou >= 0.5 for iou in things.values())
-    return {"found": f"{found} of {len(things)}", "false": len(false), "false names": false, "IoU": best}
+    found = sum(iou >= 0.5 for iou in wanted.values())
+    return {"found": found, "things": len(wanted), "false": len(false), "false names": false, "IoU": best}
 
 
 def iou_of(mask, wanted, weights) -> float:

@@ -13,6 +13,7 @@ from lexsplat.queries.colors import is_qualified, unqualified, without_color
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.listed import listed_as, refuse_doubtful
+from lexsplat.scenes.objects import objects_of
 from lexsplat.scenes.scene import Scene, open_scene
 from lexsplat.scenes.words import of_color_told
 
@@ -24,6 +25,14 @@ def demo() -> Scene:
 
 def listed(scene: Scene, name: str):
     return next(each for each in scene.objects if each.phrase == name)
+
+
+def test_a_lamp_is_no_shade_and_a_book_no_paper_where_the_vocabulary_has_these_words_too(demo):
+    words = ["shade", "page", "paper", "table lamp", "stack of books", "tablecloth"]
+    assert {each.phrase for each in objects_of(demo, words)} == {"table lamp", "stack of books", "tablecloth"}
+    assert {each.phrase for each in objects_of(demo, ["shade", "duck"])} == {"shade", "duck"}, (
+        "no lamp is named"
+    )
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,8 @@ def whole_segments(
     Args:
         codes: The segments of all levels.
         strengths: Function from a slice of the words to their strengths at each segment.
-        materials: Which of the words name materials ``[W]``: a ring of metal is a ring if that word fits, too.
+        materials: Which of the words name materials, patterns or parts ``[W]``: a ring of metal is a ring if that
+            word fits, too.
     """
     shape, is_material = (2, len(codes.masses)), np.asarray(materials, bool)
     ranked, heights = np.zeros(shape, np.int64), np.full(shape, -np.inf)

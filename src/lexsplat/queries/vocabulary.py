@@ -35,6 +35,11 @@ _PARTS = """
     spine, page, button, sole, lace, wheel, tire, roof, wing, beak, head, face, nose, ear, eye, mouth, tail, belly,
     paw, foot, leg, arm, stand, base
 """
+_MATERIALS = """
+    wood, metal, plastic, stone, brick, rubber, leather, fabric, wool, cotton, silk, denim, fur, porcelain, ceramic,
+    clay, concrete, gold, silver, copper, steel, rust, wax, foam, paper, cardboard, stripes, checkered pattern,
+    polka dots, text
+"""
 _SURFACES = """
     table, tablecloth, desk, cloth, wall, floor, ceiling, carpet, grass, road, sky, water, sand, stairs, wood, metal,
     plastic, stone, brick, leaves, ground, window, door, curtain, fence, shelf, bed, hand, wheel
@@ -48,8 +53,8 @@ def words(text: str) -> list[str]:
 
 SURFACES = frozenset(words(_SURFACES))
 """Names of surfaces, materials and parts: none of them is a "thing" when everything is asked for."""
-MATERIALS = frozenset({"wood", "metal", "plastic", "stone", "brick"})
-"""Names of materials, which give way to the name of a thing."""
+MATERIALS = frozenset(words(_MATERIALS))
+"""Names of materials and patterns, which give way to the name of a thing."""
 STUFF = frozenset({"wall", "floor", "ceiling", "ground", "road", "sky", "water", "grass", "sand", "carpet"})
 """Names of surfaces that are one, however the things in front of them divide what can be seen of them."""
 NAMES = frozenset(entry.split(" of ")[0].split()[-1] for entry in words(_EVERYDAY) + words(_BUNDLED)) - {
@@ -91,6 +96,11 @@ def is_part_alone(phrase: str) -> bool:
     """Whether a phrase is one of `PARTS` without its thing, such as "handle" or "wheels"."""
     article, _, noun = phrase.lower().rpartition(" ")
     return article in ("", "a", "an", "the") and _bare(noun) in PARTS
+
+
+def gives_way(name: str) -> bool:
+    """Whether a name gives way to that of a thing that fits: a ring of gold is a ring, a lamp is no shade."""
+    return name in MATERIALS or is_part_alone(name)
 
 
 def part_named(phrase: str) -> str:

@@ -16,7 +16,7 @@ from lexsplat.queries.presence import FAINT
 from lexsplat.queries.relations import same
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.vocabulary import MATERIALS, STUFF, SURFACES, default_vocabulary
+from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary, gives_way
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.answers import rests_on
@@ -103,7 +103,7 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     whole = whole_segments(
         codes,
         lambda part: classifier.strengths(texts[part], codes.distributions),
-        [w in MATERIALS for w in words],
+        [gives_way(word) for word in words],
     )
     named = torch.from_numpy(np.where(whole.places < 0, -1, whole.words[whole.places])).to(segments.labels)
     found: list[Selection] = []
@@ -169,8 +169,8 @@ def _named(thing: Selection, words: Sequence[str], strengths: np.ndarray) -> Sel
     Its own name describes it and its parts, unless another one describes all of it far better.
     """
     own = words.index(thing.phrase)
-    if words[own] not in MATERIALS:  # nothing is only of metal
-        strengths = np.where([word in MATERIALS for word in words], -np.inf, strengths)
+    if not gives_way(words[own]):  # nothing is only of metal
+        strengths = np.where([gives_way(word) for word in words], -np.inf, strengths)
     shares = name_probabilities(strengths)
     order = np.argsort(-shares, kind="stable")[:_NAMES]
     names = [(words[place], float(shares[place])) for place in order if shares[place] >= _LEAST_PROBABILITY]
