@@ -12,6 +12,7 @@ import os
 import shutil
 import sys
 import time
+import traceback
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,8 @@ def attempt(library: Path, action: str, scene: Path, seconds: float | None) -> s
             opened = Library.create(library)
             opened.add(scene) if action == "add" else opened.remove(scene.name)
             status = 0
+        except Exception:
+            traceback.print_exc()
         finally:
             os._exit(status)
     return outcome(child, seconds)
