@@ -310,9 +310,8 @@ def without_state(words: str) -> tuple[str, str]:
     found = _STATE.match(words)
     if found is None:
         return words, ""
-    return found[
-        "thing"
-    ], f'the answer is the thing: "{found["state"]}" is a state, which photos may not tell'
+    note = f'the answer is the thing: "{found["state"]}" is a state, which photos may not tell'
+    return found["thing"], note
 
 
 def says_more(statement: str) -> str:
