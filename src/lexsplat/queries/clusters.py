@@ -7,11 +7,12 @@ cluster of the nearest firm one but link nothing. Dimension letters: M points, C
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+
+from lexsplat.runtime.device import kernel_threads
 
 _NEIGHBORS = 8
 _SEARCHED = _NEIGHBORS + 2
@@ -46,7 +47,7 @@ def clusters(
     if count < 2:
         return np.zeros(count, np.intp)
     firm = firm if firm.any() else np.ones(count, bool)
-    threads = torch.get_num_threads() if count >= _MANY else 1
+    threads = kernel_threads() if count >= _MANY else 1
     searched = min(_SEARCHED, count)
     apart, found = _tree(points).query(points, k=searched, workers=threads)
     spacings = apart[:, min(_SIXTH + 1, count) - 1]

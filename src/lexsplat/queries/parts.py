@@ -29,6 +29,7 @@ from torch import Tensor
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.queries.clusters import LINK, spacing
 from lexsplat.queries.segments import SEGMENT_THRESHOLD
+from lexsplat.runtime.device import kernel_threads
 
 HELD = 0.2
 """A part without a thing, such as "handle", is a part of each object that has this share of what its name selects."""
@@ -124,7 +125,7 @@ def part_scores(relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: 
 def _links(values: FloatArray, means: FloatArray, colors: FloatArray, weights: FloatArray) -> csr_array:
     """Links ``[M, M]`` to neighbors, by how alike their colors and ``values`` are; they add up to 1 for each."""
     count, neighbors = len(values), min(NEIGHBORS + 1, len(values))
-    found = cKDTree(means).query(means, k=neighbors, workers=torch.get_num_threads())[1][:, 1:]
+    found = cKDTree(means).query(means, k=neighbors, workers=kernel_threads())[1][:, 1:]
     features = np.column_stack([colors / COLOR, values / SCORE])
     apart = features[found]
     apart -= features[:, None]

@@ -36,15 +36,15 @@ _kernel_threads: ContextVar[int | None] = ContextVar("kernel_threads", default=N
 
 
 @contextlib.contextmanager
-def threads_for_kernels() -> Iterator[None]:
-    """Run torch on one thread inside the block, and compiled kernels on as many as torch used before.
+def threads_for_kernels(count: int = 1) -> Iterator[None]:
+    """Run torch on ``count`` threads inside the block at most, and compiled kernels on as many as torch used before.
 
     The threads of torch wait by spinning. Where its operations take less than a millisecond, as those between the
     kernels of a view do, that costs more processor time than they.
     """
     token = _kernel_threads.set(kernel_threads())
     try:
-        with one_thread():
+        with torch_threads(max(1, min(count, torch.get_num_threads()))):
             yield
     finally:
         _kernel_threads.reset(token)

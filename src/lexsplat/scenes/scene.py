@@ -46,7 +46,7 @@ from lexsplat.queries.thresholds import check_threshold
 from lexsplat.queries.vocabulary import thing_of_part
 from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.bounded import Bounded
-from lexsplat.runtime.device import choose_device
+from lexsplat.runtime.device import choose_device, kernel_threads, torch_threads
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.lazy import at_first_call
 from lexsplat.runtime.progress import Listener, silent
@@ -153,7 +153,7 @@ class Scene:
         found = {prompt: self._texts.get(prompt) for prompt in dict.fromkeys(prompts)}
         new = [prompt for prompt, vector in found.items() if vector is None]
         if new:  # in one call, so that the cache on disk is written once
-            with self._working:
+            with self._working, torch_threads(kernel_threads()):  # `new_words` uses few
                 vectors = embed_prompts(new, self.encode_text, self.query.templates)
             found.update((prompt, self._texts.put(prompt, vector)) for prompt, vector in zip(new, vectors))
         return torch.stack([vector for prompt in prompts if (vector := found[prompt]) is not None])

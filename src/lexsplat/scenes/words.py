@@ -7,6 +7,7 @@ A kind such as "toy" is its members (`lexsplat.queries.kinds`), a part is cut wi
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,7 @@ from lexsplat.queries.scoring import form_used, scores_in_form
 from lexsplat.queries.selection import Presence, Selection
 from lexsplat.queries.thresholds import BORDER
 from lexsplat.queries.vocabulary import STUFF, SURFACES, is_part, is_part_alone, part_named, thing_of_part
+from lexsplat.runtime.device import threads_for_kernels
 from lexsplat.scenes.gone import gone_nouns, noun_of
 from lexsplat.scenes.listed import doubt, holding, listed_as
 from lexsplat.scenes.pixels import object_colors, seen_colors
@@ -33,6 +35,8 @@ if TYPE_CHECKING:
 
 MEMBER = 0.9
 """Score of an object that is the answer, where language has less: at the border itself, masks stay empty."""
+_PER_THREAD = 100_000
+"""Gaussians for each thread of torch: with fewer, waiting for each other costs more than it saves."""
 
 
 @dataclass(eq=False)
@@ -62,10 +66,11 @@ class Word:
 
 def new_words(scene: Scene, prompts: list[str]) -> Iterator[Word]:
     """Scores and presence of prompts that were not asked before, each when the former ones are known."""
-    question = scene.question(prompts)
-    scores = gaussian_relevancy(scene.field, question)
-    presences = scene.presence_classifier.classify(prompts, question.positives, scores)
-    formed = scores_in_form(scene.field, scene.query, scores, presences)
+    with _few_threads(scene):
+        question = scene.question(prompts)
+        scores = gaussian_relevancy(scene.field, question)
+        presences = scene.presence_classifier.classify(prompts, question.positives, scores)
+        formed = scores_in_form(scene.field, scene.query, scores, presences)
     # Copies: a row would keep the scores of all prompts asked with it.
     words = [Word(row.clone(), own.clone(), here) for row, own, here in zip(formed, scores, presences)]
     return (with_objects(scene, prompt, word) for prompt, word in zip(prompts, words))
@@ -75,8 +80,13 @@ def with_objects(scene: Scene, prompt: str, word: Word) -> Word:
     """The answer to a prompt, given its relevancy and its presence by language."""
     if word.presence != "no" and (noun := noun_of(prompt)) in gone_nouns(scene):
         return replace(word, scores=word.own, presence="no", note=f"an edit took the {noun} away")
-    word = of_qualities(scene, prompt, of_part(scene, prompt, of_kind(scene, prompt, word)))
-    return noted(scene, prompt, _if_visible(scene, word))
+    with _few_threads(scene):
+        word = of_qualities(scene, prompt, of_part(scene, prompt, of_kind(scene, prompt, word)))
+        return noted(scene, prompt, _if_visible(scene, word))
+
+
+def _few_threads(scene: Scene) -> AbstractContextManager[None]:
+    return threads_for_kernels(len(scene.gaussians) // _PER_THREAD)
 
 
 def noted(scene: Scene, prompt: str, word: Word) -> Word:
