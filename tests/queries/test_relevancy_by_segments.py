@@ -45,6 +45,21 @@ def test_a_part_that_scores_low_is_taken_with_its_thing():
     assert taken([0.9, 0.5, 0.16, 0.0, 0.0, 0.0]) == [True, True, True, False, False, False]
 
 
+def test_a_thin_piece_that_a_level_joins_to_what_is_behind_it_is_taken_with_its_thing():
+    # As the stand of a lamp (3) before a wall (4): the level of things joins them.
+    weights = torch.tensor([1.0, 1.0, 1.0, 0.3, 9.0, 9.0]).repeat_interleave(4)
+    lamp = [0.9, 0.85, 0.9]
+    assert taken([*lamp, 0.95, 0.0, 0.0], weights) == [True, True, True, True, False, False]
+    assert taken([*lamp, 0.85, 0.0, 0.0], weights)[3] is False, "no better than most of the lamp"
+    weights[12:16] = 0.1
+    assert taken([*lamp, 0.95, 0.0, 0.0], weights)[3] is False, "a speck"
+
+
+def test_pieces_that_score_below_half_are_left_whatever_is_taken():
+    weights = torch.tensor([1.0, 1.0, 1.0, 0.3, 9.0, 9.0]).repeat_interleave(4)
+    assert taken([0.45, 0.4, 0.45, 0.48, 0.0, 0.0], weights)[3] is False
+
+
 def test_something_is_taken_where_nothing_exceeds_half():
     assert taken([0.35, 0.4, 0.45, 0.1, 0.1, 0.1]) == [True, True, True, False, False, False]
 

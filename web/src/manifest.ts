@@ -80,6 +80,10 @@ export interface SegmentRule {
   lowest: number;
   /** Levels whose taken segments lie below this do not compete. */
   border: number;
+  /** A segment of the lowest level that is left scores higher than this share of what is taken, or it stays left. */
+  better: number;
+  /** Such segments are taken if they weigh at least this share of what is taken. */
+  enough: number;
   /** Share of a splat's own relevancy in its score; the rest is its segment's. */
   own_share: number;
   steepness: number;

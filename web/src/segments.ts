@@ -88,8 +88,12 @@ export class Segments {
     const spread = Math.max(cut.taken - cut.left, 1e-6);
     // What all splats of a lowest segment share is computed once: a scene has millions of splats.
     const slope = steepness / spread;
-    const shared = lowest.map((_, label) => ((1 - share) * cut.scores[level[label]] - cut.limit) * slope);
-    const floor = lowest.map((_, label) => threshold * Number(cut.scores[level[label]] >= cut.limit));
+    const means = lowest.map((sum, label) => sum / Math.max(this.#sums[label], 1e-12));
+    const taken = Array.from(level, (segment) => cut.scores[segment] >= cut.limit);
+    const pieces = piecesLeft(means, this.#sums, taken, this.rule);
+    const scored = means.map((mean, label) => (pieces[label] ? mean : cut.scores[level[label]]));
+    const shared = scored.map((score) => ((1 - share) * score - cut.limit) * slope);
+    const floor = lowest.map((_, label) => threshold * Number(taken[label] || pieces[label]));
     // The own relevancy of a splat counts by how certain it is beside what is taken.
     let mass = 0;
     let certain = 0;
@@ -113,6 +117,18 @@ export class Segments {
 function before(first: Cut, second: Cut, border: number): boolean {
   const [a, b] = [first.taken >= border, second.taken >= border];
   return a === b ? second.gap > first.gap : b;
+}
+
+/** The lowest segments that a cut leaves though they score higher than most of what it takes. */
+function piecesLeft(means: Float64Array, masses: Float64Array, taken: boolean[], rule: SegmentRule): boolean[] {
+  const inside = [...means.keys()].filter((label) => taken[label]).sort((a, b) => means[a] - means[b]);
+  const running: number[] = [];
+  for (const label of inside) running.push((running.at(-1) ?? 0) + masses[label]);
+  const total = running.at(-1) ?? 0;
+  const usual = means[inside[running.findIndex((sum) => sum >= rule.better * total)]];
+  const pieces = taken.map((own, label) => !own && means[label] >= Math.max(usual, rule.border));
+  const weight = masses.reduce((sum, mass, label) => sum + (pieces[label] ? mass : 0), 0);
+  return pieces.map((piece) => piece && weight >= rule.enough * total);
 }
 
 /** The widest gap between the sorted scores of the segments of a level. */

@@ -5,7 +5,9 @@ training views show of them. A cut through the sorted scores separates segments 
 left, in the middle of the widest gap. The level whose gap is widest gives the answer: a mug is taken whole where its
 parts score alike, and its handle alone where only the handle scores high. As long as some level has segments above
 0.5, levels whose taken segments lie below it do not compete: what is taken there resembles the prompt a little more
-than the rest, such as the whole mug for "mug handle".
+than the rest, such as the whole mug for "mug handle". A coarse level may join a thin piece of a thing, such as the
+stand of a lamp, to what is behind it. So segments of the lowest level that score higher than most of what is taken
+are taken, too, where they weigh enough.
 
 The result is a score in 0..1 for each Gaussian. It is at least 0.5 exactly for Gaussians of taken segments, so the
 threshold of masks and of selections is 0.5 for every prompt. On both sides of it the score rises with the Gaussian's
@@ -33,6 +35,10 @@ LOWEST = 0.6
 """A cut is above this share of the best segment's score."""
 BORDER = 0.5
 """Levels whose taken segments lie below this do not compete."""
+BETTER = 0.75
+"""A segment of the lowest level that is left scores higher than this share of what is taken, or it stays left."""
+ENOUGH = 0.05
+"""Such segments are taken if they weigh at least this share of what is taken."""
 OWN_SHARE = 0.7
 """Share of a Gaussian's own relevancy in its score; the rest is its segment's."""
 STEEPNESS = 8.0
@@ -90,6 +96,7 @@ def segment_relevancy(relevancy: Tensor, segments: Segments, uncertainties: Tens
     lowest = np.stack([_sums(labels, weights * row, levels.shape[1]) for row in own])
     masses = _sums(labels, weights, levels.shape[1])
     certainties = None if uncertainties is None else 1 - uncertainties.detach().cpu().float().numpy()
+    means = lowest / np.maximum(masses, 1e-12)
     certain = masses if certainties is None else _sums(labels, weights * certainties, levels.shape[1])
     cuts = [_cut(lowest, masses, level) for level in levels]
     result = np.empty_like(own)
@@ -101,6 +108,8 @@ def segment_relevancy(relevancy: Tensor, segments: Segments, uncertainties: Tens
         at_lowest = cut.scores[prompt][levels[place]]
         limit, spread = cut.limits[prompt], max(cut.taken[prompt] - cut.left[prompt], 1e-6)
         taken = at_lowest >= limit
+        pieces = _pieces_left(means[prompt], masses, taken)
+        at_lowest, taken = np.where(pieces, means[prompt], at_lowest), taken | pieces
         # Single precision, in place: this is all that is done for each Gaussian.
         odds = own[prompt] * np.float32(OWN_SHARE)
         if certainties is not None:
@@ -133,6 +142,15 @@ def _cut(lowest: FloatArray, lowest_masses: FloatArray, level: NDArray[np.int64]
     taken = scores >= limits[:, None]
     means = [(sums * side).sum(1) / np.maximum((masses * side).sum(1), 1e-12) for side in (taken, ~taken)]
     return _Cut(scores, masses, gaps[rows, best], limits, *means)
+
+
+def _pieces_left(means: FloatArray, masses: FloatArray, taken: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The lowest segments ``[S]`` that a cut leaves though they score higher than most of what it takes."""
+    order = np.argsort(means[taken], kind="stable")
+    running = np.cumsum(masses[taken][order])
+    usual = means[taken][order][np.searchsorted(running, BETTER * running[-1])]
+    pieces = ~taken & (means >= max(usual, BORDER))
+    return pieces & (masses[pieces].sum() >= ENOUGH * running[-1])
 
 
 def _sums(places: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:

@@ -34,8 +34,9 @@ def splat_codes(language: StoredLanguage) -> bytes:
 
 def segment_rule() -> dict[str, float]:
     """The constants by which the page takes or leaves segments: those of `lexsplat.queries.segments`."""
-    named = constants_of(rule, "LOWEST", "BORDER", "OWN_SHARE", "STEEPNESS", "MOST_CERTAIN", "BELOW")
-    return {**named, "threshold": rule.SEGMENT_THRESHOLD}
+    cut = constants_of(rule, "LOWEST", "BORDER", "BETTER", "ENOUGH")
+    named = constants_of(rule, "OWN_SHARE", "STEEPNESS", "MOST_CERTAIN", "BELOW")
+    return {**cut, **named, "threshold": rule.SEGMENT_THRESHOLD}
 
 
 def part_rule() -> dict[str, float]:
