@@ -178,6 +178,17 @@ def test_a_stem_of_no_selection_carries_a_shade_that_would_else_float():
     assert not holds("on", without["lamp"], without["table"], FRAME)
 
 
+def test_what_stands_on_a_table_is_not_on_the_floor_that_has_a_few_points_of_the_table():
+    made = room(np.random.default_rng(0))
+    edge = block(np.random.default_rng(1), (-0.8, 0.8), (-0.8, 0.8), (-0.1, 0.03), 40)
+    floor = np.concatenate([made.pop("floor"), edge])
+    things = selections({**made, "floor": floor})
+    assert holds("on", things["mug"], things["table"], FRAME)
+    assert not holds("on", things["mug"], things["floor"], FRAME)
+    assert not holds("on", things["banana"], things["floor"], FRAME)
+    assert holds("on", things["dog"], things["floor"], FRAME)
+
+
 def test_under_a_thing_is_what_carries_it_and_not_what_is_below_that(things):
     def names(relation, reference):
         everything = things["table"].described(

@@ -33,6 +33,9 @@ _BEYOND = 0.04
 """On each side of the middle of the foot lies at least this share of the surface: the foot is not beside it."""
 _TAIL = 0.004
 """The same where the whole surface counts: fewer points than these are strays."""
+_DEEP = 0.7
+"""Where a surface lies this many heights of a thing below its foot for the most part, its few points at the foot are
+of something else, such as a table's edge in the floor. Tables and cloths have up to .42, floors below tables 1.1."""
 _BEHIND = 1.0
 """A thing hides the surface behind it: it may stand this many of its radii beyond what is seen of a level one."""
 _LEVEL = 0.25
@@ -192,6 +195,8 @@ def _gap(upper: Body, lower: Body, whole: Body, overlapping: bool) -> tuple[floa
         if not _surrounds(near, foot) and not (level and (overlapping or _surrounds(whole, foot, _TAIL))):
             return np.inf, top - bottom
         surfaces = np.quantile(near.heights, [0.5, 0.9, 0.98])
+        if lower.normal is None and bottom - surfaces[0] > _DEEP * (top - bottom):
+            surfaces = surfaces[:1]
     else:
         bottom, top = lower.span()
         head = lower.only(lower.heights >= top - _FOOT * (top - bottom))
