@@ -25,6 +25,7 @@ from lexsplat.geometry.rotations import matrices_from_quaternions
 from lexsplat.geometry.world import World
 from lexsplat.queries.best_views import promising_views, visible_share
 from lexsplat.queries.clusters import LINK, clusters, spacing
+from lexsplat.queries.pieces import with_pieces
 from lexsplat.queries.places import given_length, place_of
 from lexsplat.queries.touching import divided
 from lexsplat.runtime.errors import QueryError
@@ -434,6 +435,7 @@ class Selection:
         firm = opacities >= FAINT
         counted = None if self.seen is None else self.seen.counted(self.indices)
         labels = divided(points, firm, clusters(points, firm, counted), self.up.direction)
+        labels = with_pieces(self.selected, labels, opacities)
         return labels, np.bincount(labels, weights=opacities).astype(np.float64)
 
 

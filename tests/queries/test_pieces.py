@@ -1,0 +1,50 @@
+"""Thin pieces that few long Gaussians show, such as the stand of a lamp."""
+
+import numpy as np
+import pytest
+import torch
+
+from lexsplat.geometry.gaussians import gaussians_from_points
+from lexsplat.queries.pieces import with_pieces
+
+
+def lamp(stand_length: float, below: float, count: int = 6):
+    """A shade of 80 round Gaussians around the origin, and a stand of long upright ones that ends below it."""
+    rng = np.random.default_rng(0)
+    shade = rng.uniform(-0.2, 0.2, (80, 3))
+    stand = np.c_[np.zeros((count, 2)), -0.2 - below - stand_length * (1 + np.arange(count))]
+    points = np.concatenate([shade, stand])
+    gaussians = gaussians_from_points(points, np.full((len(points), 3), 0.5), sh_degree=0, opacity=0.8)
+    scales = torch.full((len(points), 3), 0.02)
+    scales[80:, 2] = stand_length
+    made = gaussians.map(lambda tensor: tensor)
+    made.log_scales.copy_(scales.log())
+    labels = np.repeat([0, 1], [80, count])
+    return made, labels, np.full(len(points), 0.8)
+
+
+def test_a_stand_whose_gaussians_reach_the_shade_is_a_piece_of_the_lamp():
+    assert with_pieces(*lamp(stand_length=0.1, below=0.0)).tolist() == [0] * 86
+
+
+def test_a_stick_that_does_not_reach_the_shade_is_not():
+    assert with_pieces(*lamp(stand_length=0.1, below=0.2)).tolist() == [0] * 80 + [1] * 6
+
+
+def test_round_gaussians_at_the_same_distance_do_not_reach_it():
+    gaussians, labels, opacities = lamp(stand_length=0.1, below=0.0)
+    gaussians.log_scales[80:, 2] = np.log(0.02)
+    assert with_pieces(gaussians, labels, opacities).tolist() == labels.tolist()
+
+
+@pytest.mark.parametrize("count", [3, 20], ids=["a speck", "as large as a thing"])
+def test_neither_specks_nor_things_are_pieces(count):
+    gaussians, labels, opacities = lamp(stand_length=0.1, below=0.0, count=count)
+    assert with_pieces(gaussians, labels, opacities).tolist() == labels.tolist()
+
+
+def test_clusters_are_numbered_from_0_and_nothing_has_no_pieces():
+    gaussians, labels, opacities = lamp(stand_length=0.1, below=0.0)
+    assert with_pieces(gaussians, 1 - labels, opacities).tolist() == [0] * 86
+    empty = np.zeros(0, np.intp)
+    assert with_pieces(gaussians.select(torch.zeros(0, dtype=torch.int64)), empty, empty * 1.0).size == 0
