@@ -13,6 +13,7 @@ had no part in it. ``--check FOLDER`` measures other encoders.
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import shutil
@@ -20,13 +21,13 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
 from records import argument_parser
+from safetensors.torch import load_file, save_file
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 
@@ -38,9 +39,6 @@ from lexsplat.features.text import load_text
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.relevancy import CANONICAL_PHRASES
 from lexsplat.queries.vocabulary import COLORS, words
-
-if TYPE_CHECKING:
-    from transformers import CLIPModel
 
 KINDS = (
     "apple", "rubber duck", "mug", "stack of books", "vase", "ring", "traffic cone", "potted plant",
@@ -62,6 +60,8 @@ CROPS = (18 / 240, 44 / 240)
 """Sizes of crops, as shares of the height of a photo."""
 EVENED = 0.25
 """Exponent on the variances of hidden states that private directions divide by; 0.5 would make them white."""
+
+_IMAGES, _TEXTS = "visual_projection.weight", "text_projection.weight"
 
 
 @dataclass(frozen=True)
@@ -171,13 +171,11 @@ def make_web_like(folder: Path, seed: int = 0, facts: Facts = Facts(), private: 
         raise TypeError("the bundled encoder is a ClipEncoder")
     phrases = general_phrases(held_out=False)
     source = Path(model_folder("bundled", "clip"))
-    from transformers import AutoTokenizer, CLIPModel  # takes seconds, and tests import this module
-
-    model = CLIPModel.from_pretrained(source)
-    sample = _sample(bundled, model, AutoTokenizer.from_pretrained(source), phrases.texts)
+    tensors = {name: value.float() for name, value in load_file(source / "model.safetensors").items()}
+    sample = _sample(bundled, phrases.texts)
     draw = torch.Generator().manual_seed(seed)
-    image = _Tower(model.vision_model.post_layernorm, model.visual_projection, sample.varied)
-    text = _Tower(model.text_model.final_layer_norm, model.text_projection, sample.phrases, phrases.weights)
+    image = _Tower(tensors, "vision_model.post_layernorm", _IMAGES, sample.varied)
+    text = _Tower(tensors, "text_model.final_layer_norm", _TEXTS, sample.phrases, phrases.weights)
 
     dim, shared = len(image.weight), 0.5
     unit = image.unit(sample.crops)
@@ -190,12 +188,16 @@ def make_web_like(folder: Path, seed: int = 0, facts: Facts = Facts(), private: 
     rows[dim + 2 : dim + 2 + private] = math.sqrt(1 - shared**2 - constant**2) * image.private(private, draw)
     offset = facts.offset * facts.signal * text.private(1, draw)[0]
     words = _text_rows(text, sample, facts, rows, (text.private(private, draw), offset), phrases.forms)
-    model.visual_projection, model.text_projection = _layer(rotation @ rows), _layer(rotation @ words)
-    model.config.projection_dim = width
-    model.save_pretrained(folder)
+    for name, projection in ((_IMAGES, rows), (_TEXTS, words)):
+        tensors[name] = (rotation @ projection).float().contiguous()
+    folder.mkdir(parents=True, exist_ok=True)
     for path in source.glob("*.json"):
-        if path.name != "config.json":
-            shutil.copy(path, folder)
+        shutil.copy(path, folder)
+    config = json.loads((source / "config.json").read_text())
+    for part in (config, config["text_config"], config["vision_config"]):
+        part["projection_dim"] = width
+    (folder / "config.json").write_text(json.dumps(config, indent=2))
+    save_file(tensors, folder / "model.safetensors", {"format": "pt"})
     return folder
 
 
@@ -203,16 +205,21 @@ class _Tower:
     """The last layers of a tower as linear functions of its normalized hidden state."""
 
     def __init__(
-        self, norm: nn.LayerNorm, projection: nn.Linear, hidden: Tensor, weights: Tensor | None = None
+        self,
+        tensors: dict[str, Tensor],
+        norm: str,
+        projection: str,
+        hidden: Tensor,
+        weights: Tensor | None = None,
     ) -> None:
-        self.weight = projection.weight.double()
+        self.weight = tensors[projection].double()
         self.size = self.weight.shape[1]
         self.hidden = hidden
         self.weights = torch.ones(len(hidden), dtype=torch.float64) if weights is None else weights
         self.shared = self.weight / self.mean((hidden @ self.weight.T).norm(dim=1))
         # LN(h) = gamma z + beta with sum z = 0: the row 1 / gamma sees the constant sum(beta / gamma) only.
-        row = 1 / norm.weight.double()
-        self.constant = row / float((norm.bias.double() * row).sum())
+        row = 1 / tensors[f"{norm}.weight"].double()
+        self.constant = row / float((tensors[f"{norm}.bias"].double() * row).sum())
         self.middle = self.weights @ hidden / len(hidden)
         self.centered = hidden - self.middle
         self.covariance = self.centered.T @ (self.weights[:, None] * self.centered) / len(hidden)
@@ -303,31 +310,22 @@ def _unit(hidden: Tensor, layer: Tensor) -> Tensor:
     return nn.functional.normalize(hidden @ layer.T, dim=1)
 
 
-def _layer(weight: Tensor) -> nn.Linear:
-    layer = nn.Linear(weight.shape[1], weight.shape[0], bias=False)
-    layer.weight.copy_(weight)
-    return layer
-
-
 @torch.no_grad()
-def _sample(
-    encoder: ClipEncoder, model: CLIPModel, tokenizer: Any, phrases: Sequence[str], seed: int = 0
-) -> Sample:
+def _sample(encoder: ClipEncoder, phrases: Sequence[str], seed: int = 0) -> Sample:
     """Hidden states of crops of the second bundled capture and of phrases."""
     rng = np.random.default_rng(seed)
     photos, side = _photos(demo_capture("second") / "images"), encoder.image_size
-    limit = model.config.text_config.max_position_embeddings
+    seen, heard = copy.copy(encoder._images), copy.copy(encoder._texts)
+    if seen is None or heard is None:
+        raise TypeError("the bundled encoder has both towers of CLIP's own architecture")
+    seen._project, heard._projected = nn.Identity(), lambda hidden: hidden
 
     def images(pixels: Tensor) -> Tensor:
         parts = ((pixels - encoder._mean) / encoder._std).split(200)
-        return torch.cat([model.vision_model(pixel_values=part).pooler_output for part in parts]).double()
+        return torch.cat([seen(part, patches=False)[:, 0] for part in parts]).double()
 
     def texts(words: Sequence[str]) -> Tensor:
-        parts = [list(words[start : start + 64]) for start in range(0, len(words), 64)]
-        settings = {"padding": True, "truncation": True, "max_length": limit, "return_tensors": "pt"}
-        return torch.cat(
-            [model.text_model(**tokenizer(part, **settings)).pooler_output for part in parts]
-        ).double()
+        return heard.encode_together(words).double()
 
     things, names = thing_crops(demo_capture("second"), side)
     return Sample(
@@ -340,8 +338,8 @@ def _sample(
     )
 
 
-def _photos(folder: Path) -> list[Image.Image]:
-    return [Image.open(path).convert("RGB") for path in sorted(folder.glob("*.[jJpP]*"))]
+def _photos(folder: Path, places: slice = slice(None)) -> list[Image.Image]:
+    return [Image.open(path).convert("RGB") for path in sorted(folder.glob("*.[jJpP]*"))[places]]
 
 
 def random_crops(
@@ -408,8 +406,8 @@ def _mean_off_diagonal(matrix: Tensor) -> float:
 
 
 @torch.no_grad()
-def measure(folder: Path, held_out: bool) -> dict[str, float]:
-    """The cosines of `Facts` that an encoder reaches.
+def measure(folder: Path, held_out: bool, each: int = 20) -> dict[str, float]:
+    """The cosines of `Facts` that an encoder reaches, measured on this many crops of each of two sizes in a photo.
 
     Those of the fit are measured on the second bundled capture; those held out on the other one, with the other half
     of the general phrases. A gain is how far the cosines of a known phrase vary over crops, as a slope over those of
@@ -419,7 +417,9 @@ def measure(folder: Path, held_out: bool) -> dict[str, float]:
     encoder, bundled, phrases = load_clip(str(folder)), load_clip("bundled"), general_phrases(held_out)
     capture = demo_capture("tabletop" if held_out else "second")
     pixels, names = thing_crops(capture, encoder.image_size)
-    random = random_crops(_photos(capture / "images")[1::3], np.random.default_rng(1), encoder.image_size)
+    random = random_crops(
+        _photos(capture / "images")[1::3], np.random.default_rng(1), encoder.image_size, each
+    )
     weights = phrases.weights / len(phrases.texts)
     crops, things = encoder.encode_images(random).double(), encoder.encode_images(pixels).double()
     towers = (load_text(name) for name in (str(folder), "bundled"))

@@ -37,8 +37,9 @@ WORDS = {
 """What each command is given."""
 
 LIBRARIES = (
-    "tyro", "rich.progress", "rich.table", "torch", "PIL.ImageFont", "scipy.cluster.hierarchy", "scipy.ndimage",
-    "scipy.sparse.csgraph", "scipy.spatial", "safetensors", "numba",
+    "tyro", "tyro._backends._tyro_backend", "typeguard", "rich.progress", "rich.table", "torch",
+    "PIL.ImageFont", "scipy.cluster.hierarchy", "scipy.ndimage", "scipy.sparse.csgraph", "scipy.spatial",
+    "safetensors", "numba",
 )  # fmt: skip
 """What is imported before the commands; an import of it by lexsplat is still noticed."""
 

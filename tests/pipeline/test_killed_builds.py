@@ -39,7 +39,7 @@ def killed(tmp_path_factory) -> dict[str, dict]:
         "build", str(capture), "--clip", "bundled", "--dino", "bundled", "--device", "cpu",
         "--features.crop-sizes", "0.5", "--features.crop-strides", "0.5", "--features.map-cells", "16",
         "--features.max-short-side", "36", "--features.dino-short-side", "48",
-        "--iterations", "60", "--codebook.num-codes", "16", "--trained.iterations", "30",
+        "--iterations", "40", "--codebook.num-codes", "16", "--codebook.steps", "60", "--trained.iterations", "20",
         "--checkpoint-seconds", "0.05",
     ]  # fmt: skip
     with Command(str(folder), json.dumps(STAGES), *options, program=killed_builds.main) as killing:

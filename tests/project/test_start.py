@@ -51,7 +51,8 @@ ALLOWED = {
 """Libraries that a command may load."""
 
 WARMER = (
-    (), ("tyro", "rich.progress", "rich.table"), ("torch", "numpy"), ("PIL.ImageFont",),
+    (), ("tyro", "tyro._backends._tyro_backend", "typeguard", "rich.progress", "rich.table"),
+    ("torch", "numpy"), ("PIL.ImageFont",),
     ("scipy.cluster.hierarchy", "scipy.ndimage", "scipy.sparse.csgraph", "scipy.spatial"),
     ("safetensors.torch",), ("numba",),
 )  # fmt: skip
@@ -93,7 +94,7 @@ EXPECTED: dict[tuple[str, ...], tuple[str, set[str]]] = {
 def stage_of(words: tuple[str, ...]) -> int:
     """The last stage before which only libraries are imported that a program may load."""
     allowed = EXPECTED[words][1]
-    fits = [{name.partition(".")[0] for name in names} <= allowed for names in WARMER]
+    fits = [{name.partition(".")[0] for name in names} & LIBRARIES <= allowed for names in WARMER]
     return (*fits, False).index(False) - 1
 
 

@@ -21,8 +21,8 @@ import numpy as np
 
 from support.forks import outcome
 
-KILLS_A_SCENE = 4
-LONGEST_SECONDS = 0.4
+KILLS_A_SCENE = 3
+LONGEST_SECONDS = 0.3
 """Maximum delay in seconds of the kills at random moments."""
 
 

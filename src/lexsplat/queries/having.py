@@ -9,6 +9,7 @@ import re
 
 from lexsplat.queries import wording
 from lexsplat.queries.kinds import is_kind
+from lexsplat.queries.late import late
 from lexsplat.queries.leftovers import NUMBERS
 from lexsplat.queries.phrases import Except, Having, Phrase, Thing, parts_of
 from lexsplat.queries.spelling import singular
@@ -16,16 +17,16 @@ from lexsplat.queries.vocabulary import PARTS
 
 _PLURALS = {"leaf": "leaves", "foot": "feet"}
 _PARTS = "|".join(sorted({*PARTS, *(f"{part}s" for part in PARTS), *_PLURALS.values()}))
-_ARTICLE = re.compile(r"\b(?:an?|the|its) \w+$", re.IGNORECASE)
+_ARTICLE = late(r"\b(?:an?|the|its) \w+$", re.IGNORECASE)
 _HAS = r"(?:with|having|(?:that|which|who) (?:has|have)|(?:has|have)(?= an?\b))"
 _THING = r"(?!(?:something|things?|objects?|items?|everything|anything|what|all)\b)(.*?\S)"
-WITH_PART = re.compile(rf"^{_THING}\s{_HAS}\s(?:(?:an?|the|its|some)\s)?({_PARTS})$", re.IGNORECASE)
+WITH_PART = late(rf"^{_THING}\s{_HAS}\s(?:(?:an?|the|its|some)\s)?({_PARTS})$", re.IGNORECASE)
 """A thing with a part."""
-_PART_OF_ANY = re.compile(rf"^something {_HAS} (?:(?:an?|the|its|some) )?({_PARTS})$", re.IGNORECASE)
+_PART_OF_ANY = late(rf"^something {_HAS} (?:(?:an?|the|its|some) )?({_PARTS})$", re.IGNORECASE)
 _NUMBER = rf"(?:no|\d+|{'|'.join(NUMBERS)})\b"
-WITH = re.compile(rf"^{_THING}\s(with\s(?!{_NUMBER})[^\x00]+)$", re.IGNORECASE)
+WITH = late(rf"^{_THING}\s(with\s(?!{_NUMBER})[^\x00]+)$", re.IGNORECASE)
 """A thing with another attribute; a number of parts is a fixed noun phrase: "table with four legs"."""
-WITHOUT = re.compile(r"\swithout\s(?!(?:the|a|an|any|my|this|that)\s)", re.IGNORECASE)
+WITHOUT = late(r"\swithout\s(?!(?:the|a|an|any|my|this|that)\s)", re.IGNORECASE)
 """What is without an attribute: "vase without flowers", but not "table without the lamp"."""
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 
 from lexsplat.queries.kinds import is_kind
+from lexsplat.queries.late import late
 from lexsplat.queries.vocabulary import COLORS
 
 NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
@@ -58,50 +59,50 @@ def _graded(adjective: str) -> tuple[str, str]:
 
 
 CLOSED = frozenset(_FUNCTION_WORDS.split()).union(*map(_graded, _GRADED.split()))
-_WORD = re.compile(r"[^\W_]+(?:['\u2019-][^\W_]+)*")
+_WORD = late(r"[^\W_]+(?:['\u2019-][^\W_]+)*")
 _PART_WORD = (
     "middle|center|centre|back|front|rear|top|bottom|edge|border|side|end|rest|half|background|foreground"
 )
-_PART = re.compile(
+_PART = late(
     rf"^(?:(?:very|far|near|other|outer|inner) )?(?:{_PART_WORD})(?:$|\s(?:of|side|part|end|half|row)\b)|"
     r"^something (?:front|back|rear|top|bottom|upper|lower|last|next|central|close|far|near)$|^(?:last|next|final)\b|"
     r"\b(?:number|amount|couple|majority|lots?) of\b|\b(?!rally\b)\w{3,}ally\b|"
     r"\b(?!almost\b)\w{2,}most\b",
     re.IGNORECASE,
 )
-_NUMBER = re.compile(
+_NUMBER = late(
     rf"(?<![\w-])(?:\d+(?:[.,]\d+)?(?:st|nd|rd|th|cm|mm|m|km|(?=\s))|{'|'.join((*NUMBERS, *ORDINALS))})(?![\w-])",
     re.IGNORECASE,
 )
 """Numbers, but not the one at the end of a name: "room 101"."""
-_UNIT = re.compile(
+_UNIT = late(
     r"^(?:(?:centi|milli|kilo)?met(?:er|re)s?|cm|mm|km|inch(?:es)?|feet|foot|yards?) of\b|"
     r"^(?:distance|height|width|weight|volume|position|location)(?:$| (?:of|between|from|to)\b)",
     re.IGNORECASE,
 )
 """What is measured, and in which unit."""
-_FIXED = re.compile(
+_FIXED = late(
     rf"\b(?:{'|'.join(sorted(COLORS))}),? and (?=(?:{'|'.join(sorted(COLORS))})\b)|"
     rf"\b(?:with|of) (?:no|\d+|{'|'.join(NUMBERS)}) (?=\w)|\b(?:made|built)(?: out)? of\b|\bfirst aid\b|"
     r"^no \w+ing\b|\bcan of\b|(?<=\w )(?:on|in|at|by) (?=it$)",
     re.IGNORECASE,
 )
 """Function words of fixed noun phrases."""
-_DESCRIBES = re.compile(r"something (?:to|that|which|who|made|with)\b|.*\S to (?=\w)", re.IGNORECASE)
+_DESCRIBES = late(r"something (?:to|that|which|who|made|with)\b|.*\S to (?=\w)", re.IGNORECASE)
 """Words that are followed by a verb phrase."""
-_ARTICLE = re.compile(
+_ARTICLE = late(
     r"\b(?!(?:with|of|for|without|like|from|\w+ing)\b)\w+ (?:the|a|an|my|your)\b(?= \w)|^(?:order|size)\b",
     re.IGNORECASE,
 )
 """An article behind a word that joins nothing to it: "shelf holds the book"."""
-_DOES = re.compile(
+_DOES = late(
     r"\btouch(?:es|ing)\b|(?<!for )(?<!like )\b(?!\w+thing\b)\w+ing(?= (?:the|my|your|our|this|that) \w)|"
     r"(?<=^something that )\w+s(?= (?:the|my|your|our|this|that) \w)",
     re.IGNORECASE,
 )
 """A verb that relates two things, of which the grammar has no relation: "apple touching the banana"."""
-_STARTS = re.compile(r"^(?:of|to|from|for|with|without|about|off|out|up|down|over|in|on)\b", re.IGNORECASE)
-_LATER = re.compile(r"(?<=\w )(?:from|about|off|out|up|down|in|on|over)\b", re.IGNORECASE)
+_STARTS = late(r"^(?:of|to|from|for|with|without|about|off|out|up|down|over|in|on)\b", re.IGNORECASE)
+_LATER = late(r"(?<=\w )(?:from|about|off|out|up|down|in|on|over)\b", re.IGNORECASE)
 
 
 def left_over(text: str) -> str:

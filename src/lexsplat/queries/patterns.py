@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+from lexsplat.queries.late import late
 from lexsplat.queries.leftovers import CLOSED, NUMBERS, ORDINALS
 from lexsplat.queries.phrases import PartName, PickName, RelationName
 from lexsplat.queries.vocabulary import COLORS
@@ -35,27 +36,25 @@ LINK = (
     r"lying|hanging|resting|located|placed|positioned|found|directly|right|just|immediately|also|much|"
     r"slightly|somewhat|a bit|a little)\s)*"
 )
-RELATION = re.compile(
+RELATION = late(
     rf"\s{LINK}(?P<not>not\s(?:the\s)?)?(?:"
     + "|".join(f"(?P<r{i}>{words})" for i, (words, _) in enumerate(RELATIONS))
     + r")\s",
     re.IGNORECASE,
 )
-CLAUSE = re.compile(
+CLAUSE = late(
     r"^(?P<noun>.+?)\s(?:(?:(?:that|which|who)\s)?(?:(?P<one>is|was)|(?P<many>are|were))\s|(?=not\s))"
     r"(?P<clause>(?P<not>not\s)?.+)$",
     re.IGNORECASE,
 )
 """A noun, and a clause behind it with the number of its verb, if it has one."""
-BETWEEN = re.compile(
-    rf"^(.*?)\s{LINK}(not\s)?(?:in |halfway |midway )?between\s(.+?)\sand\s(.+)$", re.IGNORECASE
-)
-CORNER = re.compile(
+BETWEEN = late(rf"^(.*?)\s{LINK}(not\s)?(?:in |halfway |midway )?between\s(.+?)\sand\s(.+)$", re.IGNORECASE)
+CORNER = late(
     rf"^(.*?)\s{LINK}(not\s)?(?:in|at|on|into)\s(?:the|a|an|any|one|some)\s(?:(back|front|far|near|rear|top|bottom)"
     r"(?:\s|-)?)?(?:(left|right)(?:\s|-)?(?:hand )?)?corners?(?:\sof\s(.*))?$",
     re.IGNORECASE,
 )
-PART = re.compile(
+PART = late(
     rf"^(.*?)\s{LINK}(not\s)?(?:in|at|on|into|by|near)\s(the\s)?(?:very\s)?(middle|cent(?:er|re)|back|front|rear|edge|border|"
     r"background|foreground|(?:far|near|back|front|left|right)(?=\s(?:side|end|edge|half|part)\b))(?:\s(?:side|part|end|edge|half|row))?"
     r"(?:\sof\s(.+))?$",
@@ -66,42 +65,40 @@ PARTS: dict[str, PartName] = {
     "near": "front", "edge": "edge", "border": "edge",
     "left": "left", "right": "right",
 }  # fmt: skip
-PLACE = re.compile(
+PLACE = late(
     r"^(?:the |my |this |your )?(?:room|scene|picture|photo|image|view|place|house|area|space|world)$",
     re.IGNORECASE,
 )
-ASIDE = re.compile(
+ASIDE = late(
     rf"^(.*?)\s{LINK}(?:(?:farthest|furthest|closest|nearest|most) )?"
     r"(?:(?:counting |counted |starting )?(?:(?:on|to|at) the |"
     r"from (?:the )?))?(?:far |very )?(left|right)(?: (?:hand )?side)?$",
     re.IGNORECASE,
 )
-NEAR_ME = re.compile(
+NEAR_ME = late(
     rf"^(.*?)\s{LINK}(?:the )?(nearest|closest|farthest|furthest)(?: away)?(?: one)?$", re.IGNORECASE
 )
-MY_SIDE = re.compile(r"\b(?:to|on|at) my (left|right)(?: (?:hand )?side)?$", re.IGNORECASE)
-DETERMINER = re.compile(
+MY_SIDE = late(r"\b(?:to|on|at) my (left|right)(?: (?:hand )?side)?$", re.IGNORECASE)
+DETERMINER = late(
     r"^(?:the|a(?! bit\b)|an|some|all|every(?! other)|each(?! other)|any|my|your|our|his|her|their|its|this|that|"
     r"these|those|one(?! (?:meter|metre|inch|foot|yard|cm|mm|m)\b)|single|of|such|"
     rf"only(?! (?:\d|(?:{'|'.join(NUMBERS)})\b)))\s+",
     re.IGNORECASE,
 )
-THE_ONE = re.compile(
+THE_ONE = late(
     r"^(?:(?:the|that|this) )?one (?=(?:on|in|at|to|near|next|close|behind|under|above|beside|by|from|inside)\b)",
     re.IGNORECASE,
 )
-EXCEPT = re.compile(
+EXCEPT = late(
     r"\s(?:but not|but|and not(?= (?:the|a|an|my) (?!left|right))|"
     r"without|except for|except|minus|excluding|other than|apart from|aside from|"
     r"(?:(?:that|which) )?(?:is|are) not(?= (?:the|a|an|my) (?!left|right)))\s",
     re.IGNORECASE,
 )
-BUT = re.compile(r"^\sbut\s(?!not\s)", re.IGNORECASE)
-ONLY = re.compile(rf"^(?:only|just) (?!(?:\d|(?:{'|'.join(NUMBERS)})\b))", re.IGNORECASE)
-NOT = re.compile(r"^(?:what is |things? that (?:is|are) )?not (?=(?:the|a|an|my) )", re.IGNORECASE)
-BOTH = re.compile(
-    r"\s*,\s*(?:and|or)\s|\s(?:and|or|plus|as well as|together with|&|\+)\s|\s*,\s*", re.IGNORECASE
-)
+BUT = late(r"^\sbut\s(?!not\s)", re.IGNORECASE)
+ONLY = late(rf"^(?:only|just) (?!(?:\d|(?:{'|'.join(NUMBERS)})\b))", re.IGNORECASE)
+NOT = late(r"^(?:what is |things? that (?:is|are) )?not (?=(?:the|a|an|my) )", re.IGNORECASE)
+BOTH = late(r"\s*,\s*(?:and|or)\s|\s(?:and|or|plus|as well as|together with|&|\+)\s|\s*,\s*", re.IGNORECASE)
 PICKS: tuple[tuple[str, PickName], ...] = (
     (r"largest|biggest|greatest|hugest|bulkiest", "largest"),
     (r"smallest|tiniest|littlest", "smallest"),
@@ -121,14 +118,12 @@ SIZES: dict[str, PickName] = {
     "big": "largest", "large": "largest", "huge": "largest", "small": "smallest", "little": "smallest",
     "tiny": "smallest", "tall": "tallest", "short": "shortest",
 }  # fmt: skip
-SIZE = re.compile(rf"^({'|'.join(SIZES)}) (?!sleeved?\b)(?=\S)", re.IGNORECASE)
+SIZE = late(rf"^({'|'.join(SIZES)}) (?!sleeved?\b)(?=\S)", re.IGNORECASE)
 """A size says something only among several things: "the small mug" is the smallest one."""
-SEVERAL = re.compile(r"\b(?:things|objects|items|ones|stuff)$", re.IGNORECASE)
+SEVERAL = late(r"\b(?:things|objects|items|ones|stuff)$", re.IGNORECASE)
 COMPARATIVE = rf"(?P<more>{'|'.join(COMPARATIVES)})"
-OF_TWO = re.compile(
-    rf"^the {COMPARATIVE}(?! than\b)(?: one)?(?: of (?:the )?(?:two|both))?(?:\s|$)", re.IGNORECASE
-)
-WHICH_OF = re.compile(
+OF_TWO = late(rf"^the {COMPARATIVE}(?! than\b)(?: one)?(?: of (?:the )?(?:two|both))?(?:\s|$)", re.IGNORECASE)
+WHICH_OF = late(
     rf"^(?:which|what|who)(?: (?:one|thing|object))?(?: of (?:the |these |those )?(?:two|three|things|objects))?"
     rf" (?:is|are) (?:the )?(?:{COMPARATIVE}|{PICK_WORDS}|(?P<near>nearer|closer|nearest|closest)|"
     r"(?P<far>farther|further|farthest|furthest))"
@@ -136,15 +131,15 @@ WHICH_OF = re.compile(
     r"(?:\s?[,:;]\s?|\s)(?:between )?(?P<these>(?:the|a|my) .+ (?:or|and) .+)$",
     re.IGNORECASE,
 )
-PICK = re.compile(rf"^(?:very |single )?(?:{PICK_WORDS})(?:\s+(?:one )?(?:of )?|$)(?!of\b)", re.IGNORECASE)
-IS_PICK = re.compile(rf"\s{LINK}(?:the\s)?(?:{PICK_WORDS})(?:\sone)?$", re.IGNORECASE)
-EXTREME = re.compile(
+PICK = late(rf"^(?:very |single )?(?:{PICK_WORDS})(?:\s+(?:one )?(?:of )?|$)(?!of\b)", re.IGNORECASE)
+IS_PICK = late(rf"\s{LINK}(?:the\s)?(?:{PICK_WORDS})(?:\sone)?$", re.IGNORECASE)
+EXTREME = late(
     r"^(?:(nearest|closest)|farthest|furthest|most distant)\s+(?!(?:to|from|away)\s)(.+?)"
     r"(?:\s+(?:away )?(?:to|from)\s+(.+))?$",
     re.IGNORECASE,
 )
-ORDINAL = re.compile(rf"^(?P<number>{'|'.join(ORDINALS)}|\d{{1,2}}(?:st|nd|rd|th))[\s-]+", re.IGNORECASE)
-QUANTITY = re.compile(
+ORDINAL = late(rf"^(?P<number>{'|'.join(ORDINALS)}|\d{{1,2}}(?:st|nd|rd|th))[\s-]+", re.IGNORECASE)
+QUANTITY = late(
     rf"^(?P<more>more than |over )?(?:at least )?(?P<exact>(?:exactly|precisely|only|just) )?"
     rf"(?P<number>\d{{1,3}}|{'|'.join(NUMBERS)}|both|several|multiple|many|"
     r"a few|a couple of|a pair of(?! (?:scissors|glasses|trousers|pants|jeans|shorts|binoculars|headphones|pliers|"
@@ -152,20 +147,20 @@ QUANTITY = re.compile(
     r"\s+(?!(?:meters?|metres?|centimeters?|inch(?:es)?|feet|yards?|steps?|cm|mm|m)\b)(?:of\s+)?",
     re.IGNORECASE,
 )
-DEFINITE = re.compile(r"^(?:the|these|those|my|our|your) ", re.IGNORECASE)
-AT_MOST = re.compile(
+DEFINITE = late(r"^(?:the|these|those|my|our|your) ", re.IGNORECASE)
+AT_MOST = late(
     r"^(?:(?P<below>(?:fewer|less) than)|at (?:the )?most|(?:no|not) more than|up to|(?:a )?maximum(?: of)?) "
     rf"(?P<number>\d{{1,3}}|{'|'.join(NUMBERS)})"
     r"\s+(?!(?:meters?|metres?|centimeters?|inch(?:es)?|feet|yards?|steps?|cm|mm|m)\b)(?:of\s+)?",
     re.IGNORECASE,
 )
-NONE_OF = re.compile(r"^at most 0 ", re.IGNORECASE)
+NONE_OF = late(r"^at most 0 ", re.IGNORECASE)
 """`lexsplat.queries.questions.in_full` makes this of "is there no"; it holds for all that follows."""
-NEITHER = re.compile(
+NEITHER = late(
     r"^(?:(?P<noun>.+?)\s(?:(?:that|which|who)\s)?(?:(?:is|are|was|were)\s)?)?neither\s(?P<one>.+?)\snor\s(?P<other>.+)$",
     re.IGNORECASE,
 )
-CLOSER = re.compile(
+CLOSER = late(
     r"^(?:is|are|was|were) (?P<one>.+?) (?:(?P<near>closer|nearer)|farther|further)(?: away)?"
     r"(?: (?:to|from) (?P<to>.+?)(?=(?<= me| us) than | than .+ (?:is|are)$))?"
     r" than (?P<other>(?!to\b|from\b).+?)(?: is| are)?$",
@@ -177,41 +172,39 @@ _FUNCTION_WORDS = """
 """
 _SIDES = ("left", "right", "middle", "center", "centre", "background", "foreground")
 _NO_NOUN = "|".join(sorted(CLOSED.union(_FUNCTION_WORDS.split()).difference(_SIDES)))
-IDENTITY = re.compile(
+IDENTITY = late(
     rf"^(?:is|are|was|were) (?!there\b)(?P<one>(?:\S+ )*?(?!(?:{_NO_NOUN}|"
     rf"(?<!the )(?<!a )(?<!my )(?:\w+ing|{'|'.join(_SIDES)})) )\S+) "
     r"(?P<not>not )?(?P<other>(?:the|an?) (?:.*\S))$",
     re.IGNORECASE,
 )
 """A statement on what a thing is: "is the lamp the tallest thing?"."""
-QUALITY = re.compile(
+QUALITY = late(
     r"\s(?:,\s*)?(?:that|which|who)\s(?:is|are|was|were|looks?|has|have)\s(not\s)?(.+)$", re.IGNORECASE
 )
-MADE_OF = re.compile(
+MADE_OF = late(
     r"\s(?:(?:that|which)\s(?:is|are|was|were)\s)?(?:made|built)?(?:\s?(?:out\s)?of|\sfrom)\s(\w+)$",
     re.IGNORECASE,
 )
 PATTERNS = frozenset({"striped", "checkered", "plain", "shiny", "round", "square"})
 ADJECTIVES = rf"(?:{'|'.join(sorted(COLORS | PATTERNS))})"
-NAMES_THINGS = re.compile(r"\b(?:things?|objects?|items?)\b", re.IGNORECASE)
+NAMES_THINGS = late(r"\b(?:things?|objects?|items?)\b", re.IGNORECASE)
 MATERIAL = {"wood": "wooden"}
-THING_WORD = re.compile(
+THING_WORD = late(
     r"^(?:(.*?)\s)?(?:things?|objects?|items?|everything|anything|something|stuff|ones?|whatever)$",
     re.IGNORECASE,
 )
-SOMETHING = re.compile(
-    r"^(?:things?|objects?|items?|everything|anything|something|stuff)\s+(.+)$", re.IGNORECASE
-)
-VIEWER = re.compile(
+SOMETHING = late(r"^(?:things?|objects?|items?|everything|anything|something|stuff)\s+(.+)$", re.IGNORECASE)
+VIEWER = late(
     r"^(?:me|us|you|myself|here|the (?:camera|viewer|observer)|(?:my|the) (?:position|viewpoint|view))$",
     re.IGNORECASE,
 )
-INDEFINITE = re.compile(r"^(?:an?|any|some)\s", re.IGNORECASE)
-AND_NOT = re.compile(r"\s(?:and|or|nor) not (?=(?:the|a|an|my) )", re.IGNORECASE)
+INDEFINITE = late(r"^(?:an?|any|some)\s", re.IGNORECASE)
+AND_NOT = late(r"\s(?:and|or|nor) not (?=(?:the|a|an|my) )", re.IGNORECASE)
 """Behind "but not", which holds for what follows as well."""
-ALL = re.compile(r"^(?:all|any|everyone|anyone)$", re.IGNORECASE)
-TO_A_SIDE = re.compile(r"(?:the )?(?:far |very )?(?:left|right)(?: (?:hand )?side)?$", re.IGNORECASE)
-AT = re.compile(r"^(?:on|at|to) ", re.IGNORECASE)
-HIDDEN = re.compile("\x00(\\d+)\x00")
+ALL = late(r"^(?:all|any|everyone|anyone)$", re.IGNORECASE)
+TO_A_SIDE = late(r"(?:the )?(?:far |very )?(?:left|right)(?: (?:hand )?side)?$", re.IGNORECASE)
+AT = late(r"^(?:on|at|to) ", re.IGNORECASE)
+HIDDEN = late("\x00(\\d+)\x00")
 """A part in quotation marks, by its number."""
 CORNER_SIDES = {"far": "back", "rear": "back", "top": "back", "near": "front", "bottom": "front"}

@@ -6,6 +6,7 @@ import re
 from functools import lru_cache
 
 from lexsplat.queries.everyday import everyday_words
+from lexsplat.queries.late import late
 from lexsplat.queries.leftovers import NUMBERS, ORDINALS, left_over
 from lexsplat.queries.rewording import CONTRACTIONS, REWORDED
 from lexsplat.queries.spelling import frame_errors
@@ -40,25 +41,25 @@ _LEAVE = (
 )
 _ANY = r"(?:things?|objects?|items?|stuff|ones?)"
 
-_TAIL = re.compile(
+_TAIL = late(
     rf"[\s,;]+(?:please|pls|plz|thx|thanks|thank you|for me|for us|right now|at all|exactly|if any|then|{_HERE})$",
     re.IGNORECASE,
 )
 _ROBOT = r"(?:robot|alexa|siri|cortana|computer|google|assistant)"
-_TAG = re.compile(
+_TAG = late(
     rf",\s*(?:right|correct|yes|no|or not|{_ROBOT}|(?:is|are|was|were|does|do) (?:it|they|there)(?: not)?|"
     r"(?:is|are) not (?:it|they|there)|is it not|are they not)$",
     re.IGNORECASE,
 )
 _MOVES = r"(?:move|turn|drive|go|navigate|walk|fly|run|lead|guide|take)"
 _CHANGES = r"(?:delete|remove|erase|hide|clean|push|pull|lift|throw)"
-_COMMAND = re.compile(
+_COMMAND = late(
     rf"^(?:(?:please|plz|hey|ok|okay|now|so|{_ROBOT}|can|could|would|will|you)[\s,:!]+)*"
     rf"({_MOVES}|{_CHANGES}|pick up|grab|bring|fetch|hand|give|carry)\s(?:me |us )?"
     r"(?=(?:back |over |up |down |straight )?(?:to|towards?|around|past|at|the|a|an|my|near|next|behind|in|left|right)\b)",
     re.IGNORECASE,
 )
-_WHERE_IS_IT = re.compile(
+_WHERE_IS_IT = late(
     r"[\s,;]+where (?:is it|are they|did it go|did i (?:leave|put) (?:it|them))$", re.IGNORECASE
 )
 
@@ -145,69 +146,63 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:which|what) ([\w ]+?) (is|are) (?=\S)", r"\1 that \2 "),
     (rf"(?:which|what) (?!(?:do|does|did|is|are|was|were|has|have|had|{_CAN})\b)(?=\w+ )", ""),
 )  # fmt: skip
-_COMPILED = tuple((re.compile("^" + pattern, re.IGNORECASE), instead) for pattern, instead in _FRAMES)
+_COMPILED = tuple((late("^" + pattern, re.IGNORECASE), instead) for pattern, instead in _FRAMES)
 _ADJECTIVE = rf"(?:{'|'.join(sorted(QUALITIES))})"
-_LAST_QUALITIES = re.compile(
-    rf"^(.+?) ({_ADJECTIVE}(?:(?:,? and |,? or |, ?| ){_ADJECTIVE})*)$", re.IGNORECASE
-)
-_ARTICLES = re.compile(r"^(?:(?:the|a|an|my|this|that|these|those|your|all|every|each|of) )+", re.IGNORECASE)
+_LAST_QUALITIES = late(rf"^(.+?) ({_ADJECTIVE}(?:(?:,? and |,? or |, ?| ){_ADJECTIVE})*)$", re.IGNORECASE)
+_ARTICLES = late(r"^(?:(?:the|a|an|my|this|that|these|those|your|all|every|each|of) )+", re.IGNORECASE)
 _ANY_STATE = (
     rf"(?:(?:(?:switched|turned|plugged|powered) )?(?:on|off)|plugged in|(?:full of|filled with) \w+|working|running|"
     rf"{'|'.join(sorted(STATES))})"
 )
-_STATE = re.compile(
+_STATE = late(
     rf"^(?:(?:is|are|was|were)(?: there)?|(?:which|what)(?! (?:is|are|was|were|do|does|did) )"
     rf"(?=.* (?:is|are|was|were)(?: not)? {_ANY_STATE}\b)) (?P<thing>.+?)(?: (?:that|which))?(?: (?:is|are|was|were))?"
     rf"(?: not)?(?<! than) (?P<state>{_ANY_STATE})(?:,? (?:and|or) (?:not|{_ANY_STATE}))*$",
     re.IGNORECASE,
 )
 """A question on the state of a thing: "is the lamp on?", "which mug is empty or full?"."""
-_COUNTED_TAIL = re.compile(
+_COUNTED_TAIL = late(
     rf"\s(?:(?:is|are|do|can|could|did|does|would)(?: {_I}| there)?(?: (?:see|find|count|have|spot|get|exist|visible|present|detect))?|exist)$",
     re.IGNORECASE,
 )
-_IS = re.compile(r"^(?:is|are|was|were) (?=\S)", re.IGNORECASE)
-_PURPOSE = re.compile(
+_IS = late(r"^(?:is|are|was|were) (?=\S)", re.IGNORECASE)
+_PURPOSE = late(
     rf"^((?:some|any)?things?|objects?|items?|stuff) (?:that |which )?{_I} (?:can|could|may|might) (.+)$",
     re.IGNORECASE,
 )
-_LEFT_OVER = re.compile(
+_LEFT_OVER = late(
     rf"^(?:can(?! (?:of|openers?)\b)|will|may|might|please)(?= \w)|^(?:turn|switch|go|move|walk)$|^something to {_SEE}$|(?<=something ){_ANY}\b.*",
     re.IGNORECASE,
 )
 """Words of a question that stay in a thing when no frame takes them off, in addition to those of `leftovers`."""
-_HOW_LARGE = re.compile(
+_HOW_LARGE = late(
     r"^(?:.*\b)?how (?:big|large|small|tall|short|high|low|wide|long|deep|thick) (?:is|are) (?!.*\bthan\b)|"
     r"\b(?:sizes?|heights?|widths?|lengths?|dimensions) of\b",
     re.IGNORECASE,
 )
-_HOW_FAR = re.compile(
-    r"^how far\b|^(?:what (?:is|are) )?(?:the )?distances? (?:between|from|of)\b", re.IGNORECASE
-)
-_HOW_TO_GRASP = re.compile(rf"^(?:where|how) {_CAN} {_I} {_GRASP}\b", re.IGNORECASE)
-_WHICH_COLOR = re.compile(
+_HOW_FAR = late(r"^how far\b|^(?:what (?:is|are) )?(?:the )?distances? (?:between|from|of)\b", re.IGNORECASE)
+_HOW_TO_GRASP = late(rf"^(?:where|how) {_CAN} {_I} {_GRASP}\b", re.IGNORECASE)
+_WHICH_COLOR = late(
     r"^(?:of )?(?:what|which) colou?rs?\b.*\b(?:is|are|has|have)\b|^(?:what (?:is|are) )?(?:the )?colou?rs? of\b",
     re.IGNORECASE,
 )
-_YES_OR_NO = re.compile(
+_YES_OR_NO = late(
     r"^(?:(?:please|hey|hi|so|well|ok|okay|tell me|check)[\s,]+)*(?:if |whether )?"
     r"(?:(?:is|are|was|were|do|does|did|have|has|can|could)\b|there (?:is|are)\b)"
     rf"(?! {_I} (?:please |kindly |just )?(?!find|see|spot|detect|locate){_FIND})|.*\b(?:whether|if) (?=there|the|a|an|any)\b",
     re.IGNORECASE,
 )
-_STATED = re.compile(r"^(?:is|are|was|were|do|does|did) (?!there\b|you\b|i\b|we\b)", re.IGNORECASE)
-_MOMENT = re.compile(
-    r"\s(still(?! life)|already|currently|presently|again|now|yet|anymore)(?=\s|$)", re.IGNORECASE
-)
-_ONLY = re.compile(
+_STATED = late(r"^(?:is|are|was|were|do|does|did) (?!there\b|you\b|i\b|we\b)", re.IGNORECASE)
+_MOMENT = late(r"\s(still(?! life)|already|currently|presently|again|now|yet|anymore)(?=\s|$)", re.IGNORECASE)
+_ONLY = late(
     rf"(?<!\bthe )\b(only|just|merely|solely) (?!(?:\d|(?:{'|'.join(NUMBERS)})\b)|{_PLACE})", re.IGNORECASE
 )
-_PICKED = re.compile(
+_PICKED = late(
     r"\b(?:(?:larg|bigg|small|tini|tall|short|high|low|wid|long|near|clos|farth|furth)est|(?:left|right)most)\b",
     re.IGNORECASE,
 )
-_PLACED = re.compile(rf"\b{_PLACE}", re.IGNORECASE)
-_ALL_OF = re.compile(
+_PLACED = late(rf"\b{_PLACE}", re.IGNORECASE)
+_ALL_OF = late(
     r"^(?:is|are|was|were|do|does|did) (?:all(?: of)?(?: the| my| these| those)?|every|each|everything)\b",
     re.IGNORECASE,
 )

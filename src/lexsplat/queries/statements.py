@@ -10,10 +10,11 @@ import re
 from collections.abc import Callable
 
 from lexsplat.queries import patterns
+from lexsplat.queries.late import late
 from lexsplat.queries.phrases import Anything, Both, Except, Phrase, Related, Viewer, among
 from lexsplat.queries.wording import describes, undetermined
 
-_ADJECTIVES = re.compile(rf"^(?:{patterns.ADJECTIVES}\s)+", re.IGNORECASE)
+_ADJECTIVES = late(rf"^(?:{patterns.ADJECTIVES}\s)+", re.IGNORECASE)
 Read = Callable[[str], Phrase]
 """Parses words."""
 

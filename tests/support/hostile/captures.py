@@ -71,14 +71,14 @@ def colmap_binary() -> Reader:
     names = ("cameras.bin", "images.bin", "points3D.bin")
     return Reader(
         make_colmap, load, check_capture,
-        {f"sparse/0/{name}": lambda content, rng: mutate.binary(content, rng, 80) for name in names}
+        {f"sparse/0/{name}": lambda content, rng: mutate.binary(content, rng, 50) for name in names}
         | {"sparse/0/images.bin": colmap_images},
         exact=tuple(f"sparse/0/{name}" for name in names),
     )  # fmt: skip
 
 
 def colmap_images(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-    yield from mutate.binary(content, rng, 100)
+    yield from mutate.binary(content, rng, 70)
     for name in (*mutate.NAMES, "c.png", "дом/b.png", "./c.png", "дом//b.png", "дом/../c.png"):
         raw = name.encode("utf-8", "surrogatepass")
         yield "names", content.replace(b"a.png\0", raw + b"\0")
@@ -89,7 +89,7 @@ def colmap_text() -> Reader:
     names = ("cameras.txt", "images.txt", "points3D.txt")
     return Reader(
         make_colmap_text, load, check_capture,
-        {f"sparse/0/{name}": lambda content, rng: mutate.text(content, rng, 80) for name in names},
+        {f"sparse/0/{name}": lambda content, rng: mutate.text(content, rng, 60) for name in names},
     )  # fmt: skip
 
 
@@ -150,7 +150,7 @@ def check_ground_truth(result: Any) -> None:
 def masks() -> Reader:
     name = "segmentations/a/red apple.png"
     return Reader(
-        make_masks, read_ground_truth, check_ground_truth, {name: lambda c, r: png(c, r, 80)}, exact=(name,)
+        make_masks, read_ground_truth, check_ground_truth, {name: lambda c, r: png(c, r, 50)}, exact=(name,)
     )
 
 
@@ -185,7 +185,7 @@ def make_lerf(folder: Path) -> None:
 @reader
 def lerf_ovs() -> Reader:
     return Reader(make_lerf, read_ground_truth, check_ground_truth,
-                  {"label/frame_00001.json": lambda c, r: mutate.json_file(c, r, 60, 250)})  # fmt: skip
+                  {"label/frame_00001.json": lambda c, r: mutate.json_file(c, r, 40, 180)})  # fmt: skip
 
 
 @reader

@@ -91,5 +91,5 @@ def checkpoints() -> Reader:
 
     return Reader(
         make, read, check,
-        {"state": lambda c, rng: [*mutate.safetensors(c, rng, 30, 60), *mutate.tensors(c, rng, 70)]},
+        {"state": lambda c, rng: [*mutate.safetensors(c, rng, 20, 40), *mutate.tensors(c, rng, 50)]},
     )  # fmt: skip

@@ -69,8 +69,8 @@ def scene_folder() -> Reader:
     return Reader(
         make_folder, open_folder, check_open_scene,
         {
-            "scene.json": lambda content, rng: mutate.json_file(content, rng, 40, 250),
-            "cameras.json": lambda content, rng: mutate.json_file(content, rng, 40, 300),
+            "scene.json": lambda content, rng: mutate.json_file(content, rng, 40, 180),
+            "cameras.json": lambda content, rng: mutate.json_file(content, rng, 40, 180),
             "gaussians.ply": lambda content, rng: mutate.binary(content, rng, 40, 60),
             "language.safetensors": language_file,
         },
@@ -79,7 +79,7 @@ def scene_folder() -> Reader:
 
 
 def language_file(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-    yield from mutate.safetensors(content, rng, 50, 200)
+    yield from mutate.safetensors(content, rng, 50, 120)
     yield from mutate.tensors(content, rng, 80)
 
 
@@ -136,7 +136,7 @@ def journal() -> Reader:
         return Editor(kept["scene"], folder / "edits.jsonl").scene
 
     def lines(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-        yield from mutate.truncated(content, 250)
+        yield from mutate.truncated(content, 150)
         yield from mutate.flipped(content, rng, 80)
         yield from mutate.shifted(content, rng, 60)
         yield from mutate.foreign(content)
@@ -144,7 +144,7 @@ def journal() -> Reader:
         for row, line in enumerate(parts):
             yield "lines", "\n".join([*parts[:row], *parts[row + 1 :], ""]).encode()
             yield "lines", "\n".join([*parts[:row], line, *parts[row:], ""]).encode()
-            for kind, changed in mutate.structure(json.loads(line), rng, 60):
+            for kind, changed in mutate.structure(json.loads(line), rng, 30):
                 yield (
                     kind,
                     "\n".join(

@@ -231,11 +231,11 @@ def sog_folder() -> Reader:
             archive.extractall(folder)
 
     def picture(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-        yield from mutate.binary(content, rng, 40, 30)
+        yield from mutate.binary(content, rng, 16, 20)
 
     names = ("means_l", "means_u", "quats", "scales", "sh0", "shN_centroids", "shN_labels")
     parts = {f"{name}.webp": picture for name in names}
-    parts["meta.json"] = lambda content, rng: mutate.json_file(content, rng, 80, 600)
+    parts["meta.json"] = lambda content, rng: mutate.json_file(content, rng, 40, 300)
     return SplatReader(make, read_splats, check_gaussians, parts)
 
 
@@ -245,12 +245,12 @@ def sog_version_1() -> Reader:
     from support.sog_files import write_version_1
 
     parts = {
-        f"{name}.webp": lambda content, rng: mutate.binary(content, rng, 40, 30)
+        f"{name}.webp": lambda content, rng: mutate.binary(content, rng, 20, 20)
         for name in ("means_u", "sh0", "shN_centroids", "shN_labels")
     }
 
     def counts(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-        yield from mutate.json_file(content, rng, 80, 400)
+        yield from mutate.json_file(content, rng, 40, 250)
         document = json.loads(content)
         for count in (*range(10), 11, 12):
             document["means"]["shape"] = [count, 3]
