@@ -51,6 +51,11 @@ def test_a_thin_piece_that_a_level_joins_to_what_is_behind_it_is_taken_with_its_
     lamp = [0.9, 0.85, 0.9]
     assert taken([*lamp, 0.95, 0.0, 0.0], weights) == [True, True, True, True, False, False]
     assert taken([*lamp, 0.85, 0.0, 0.0], weights)[3] is False, "no better than most of the lamp"
+    weights[:12] = 0.05
+    assert taken([*lamp, 0.95, 0.0, 0.0], weights)[3] is False, (
+        "more than the lamp: faint remains have no pieces"
+    )
+    weights[:12] = 1.0
     weights[12:16] = 0.1
     assert taken([*lamp, 0.95, 0.0, 0.0], weights)[3] is False, "a speck"
 

@@ -82,7 +82,7 @@ export interface SegmentRule {
   border: number;
   /** A segment of the lowest level that is left scores higher than this share of what is taken, or it stays left. */
   better: number;
-  /** Such segments are taken if they weigh at least this share of what is taken. */
+  /** Such segments are taken if they weigh at least this share of what is taken, and no more than it does. */
   enough: number;
   /** Share of a splat's own relevancy in its score; the rest is its segment's. */
   own_share: number;

@@ -128,7 +128,7 @@ function piecesLeft(means: Float64Array, masses: Float64Array, taken: boolean[],
   const usual = means[inside[running.findIndex((sum) => sum >= rule.better * total)]];
   const pieces = taken.map((own, label) => !own && means[label] >= Math.max(usual, rule.border));
   const weight = masses.reduce((sum, mass, label) => sum + (pieces[label] ? mass : 0), 0);
-  return pieces.map((piece) => piece && weight >= rule.enough * total);
+  return pieces.map((piece) => piece && weight >= rule.enough * total && weight <= total);
 }
 
 /** The widest gap between the sorted scores of the segments of a level. */

@@ -38,7 +38,7 @@ BORDER = 0.5
 BETTER = 0.75
 """A segment of the lowest level that is left scores higher than this share of what is taken, or it stays left."""
 ENOUGH = 0.05
-"""Such segments are taken if they weigh at least this share of what is taken."""
+"""Such segments are taken if they weigh at least this share of what is taken, and no more than it does."""
 OWN_SHARE = 0.7
 """Share of a Gaussian's own relevancy in its score; the rest is its segment's."""
 STEEPNESS = 8.0
@@ -150,7 +150,7 @@ def _pieces_left(means: FloatArray, masses: FloatArray, taken: NDArray[np.bool_]
     running = np.cumsum(masses[taken][order])
     usual = means[taken][order][np.searchsorted(running, BETTER * running[-1])]
     pieces = ~taken & (means >= max(usual, BORDER))
-    return pieces & (masses[pieces].sum() >= ENOUGH * running[-1])
+    return pieces & (ENOUGH * running[-1] <= masses[pieces].sum() <= running[-1])
 
 
 def _sums(places: NDArray[np.int64], values: FloatArray, count: int) -> FloatArray:
