@@ -7,7 +7,7 @@ import torch
 from lexsplat.language.segment_codes import SegmentCodes, segment_codes
 from lexsplat.language.segments import Segments
 from lexsplat.queries.colors import COLOR_WORDS, NEAR, cielab, color_told, color_words, may_be
-from lexsplat.queries.objects import name_probabilities, whole_segments
+from lexsplat.queries.objects import name_probabilities, pieces_of_others, whole_segments
 
 LEVELS = torch.tensor([[0, 1, 2, 3, 4], [0, 0, 1, 2, 3], [0, 0, 1, 2, 2]])
 
@@ -122,3 +122,20 @@ def test_a_thing_may_have_a_color_that_light_or_shade_turns_into_another_one():
     assert (color_told("Grey mug"), color_told("orange"), color_told("red and white cloth")) == (
         {"gray"}, set(), {"red", "white"},
     )  # fmt: skip
+
+
+def test_a_segment_of_a_surface_that_a_thing_names_better_may_be_its_piece():
+    #            table lamp
+    strengths = [[0.9, 0.1], [0.1, 0.9], [0.1, 0.1], [0.1, 0.9], [0.1, 0.9], [0.9, 0.2], [0.1, 0.9]]
+    whole, lowest = wholes(strengths, (9, 1, 1, 1, 1)), np.arange(5)
+    assert whole.places.tolist() == [5, 5, -1, 6, 6]
+    table, known = np.array(strengths), np.array([0, 1])
+    surfaces = np.array([True, False])
+    assert pieces_of_others(whole, lowest, known, table, surfaces).tolist() == [-1, 1, -1, -1, -1]
+    assert pieces_of_others(whole, lowest, known, table, ~surfaces).tolist() == [-1] * 5, "the lamp is a lamp"
+    table[1] = 0.6, 0.9
+    assert pieces_of_others(whole, lowest, known, table, surfaces)[1] == 1, "the lamp's name fits clearly better"
+    table[1] = 0.7, 0.9
+    assert (pieces_of_others(whole, lowest, known, table, surfaces) < 0).all(), "the table's name fits, too"
+    table[1] = 0.1, 0.5
+    assert (pieces_of_others(whole, lowest, known, table, surfaces) < 0).all(), "no name fits"

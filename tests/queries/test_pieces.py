@@ -48,3 +48,21 @@ def test_clusters_are_numbered_from_0_and_nothing_has_no_pieces():
     assert with_pieces(gaussians, 1 - labels, opacities).tolist() == [0] * 86
     empty = np.zeros(0, np.intp)
     assert with_pieces(gaussians.select(torch.zeros(0, dtype=torch.int64)), empty, empty * 1.0).size == 0
+
+
+def table(gap: float):
+    """A dense part of a table top, two sparse ones behind it in a row, and a speck far from them: 4 clusters."""
+    front = np.c_[np.random.default_rng(0).uniform(0, 1, (400, 2)), np.zeros(400)]
+    back = np.array([[0.5, 1.2, 0], [0.5, 1.2 + gap, 0], [0.5, 5, 0]])
+    points = np.concatenate([front, back])
+    gaussians = gaussians_from_points(points, np.full((len(points), 3), 0.5), sh_degree=0, opacity=0.8)
+    scales = torch.full((len(points), 3), 0.02)
+    scales[400:, :2] = 0.15
+    gaussians.log_scales.copy_(scales.log())
+    return gaussians, np.array([0] * 400 + [1, 2, 3]), np.full(len(points), 0.8)
+
+
+def test_pieces_of_a_surface_join_it_however_small_and_those_join_that_reach_another_piece():
+    assert with_pieces(*table(gap=0.3)).tolist() == [0] * 400 + [1, 2, 3]
+    assert with_pieces(*table(gap=0.3), surface=True).tolist() == [0] * 402 + [1]
+    assert with_pieces(*table(gap=0.6), surface=True).tolist() == [0] * 401 + [1, 2]

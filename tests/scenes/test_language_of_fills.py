@@ -104,6 +104,6 @@ def test_recoloring_the_cloth_leaves_the_wood_where_a_bear_stood():
     wood = fill & (before.gaussians.means[:, 1] > 0.45)  # the cloth ends at 0.34
     assert int(wood.sum()) > 500
     cloth = editor.planned_mask("recolor", before.select("tablecloth"))
-    assert int((cloth & wood).sum()) < 0.05 * int(wood.sum())
+    assert int((cloth & wood).sum()) < 0.08 * int(wood.sum()), "only what lies next to the cloth"
     table = editor.planned_mask("recolor", before.select("table"))
     assert int((table & wood).sum()) > 0.9 * int(wood.sum())

@@ -137,7 +137,8 @@ def test_answers_are_those_of_python(page, demo):
         if answer["presence"] == "yes":
             selection = asked.selection(number)
             assert answer["places"] == selection.count, answer["prompt"]
-            assert answer["marked"] == pytest.approx(len(selection), rel=near), answer["prompt"]
+            # The few splats at the edge of a part may be a speck in one of the two.
+            assert answer["marked"] == pytest.approx(len(selection), rel=2 * near), answer["prompt"]
     assert [answer["from"] for answer in found[:3]] == ["dictionary", "dictionary", "text tower"]
     assert [answer["presence"] for answer in found[-2:]] == ["no", "no"]
 

@@ -7,6 +7,8 @@ import { type ObjectEntry, PageError } from "./manifest";
 
 /** Score of an object that is the answer, where language has less, as in lexsplat.scenes.words. */
 const MEMBER = 0.9;
+/** Share of an object of its name from which a word is that object, as there. */
+const PIECE = 0.3;
 
 export class Kinds {
   readonly #members: ReadonlyMap<string, number[]>;
@@ -55,6 +57,18 @@ export class Kinds {
     const own = (name: string): string[] => [name.split(" of ")[0], name].map((words) => words.split(" ").at(-1)!);
     const isOne = (name: string): boolean => own(name).some((noun) => singulars(noun).some((form) => nouns.includes(form)));
     return [...this.#objects.keys()].filter((place) => isOne(this.#objects[place].name));
+  }
+
+  /** Scores with all of each object with a noun of which some splats are taken (completed in lexsplat.scenes.words). */
+  completed(scores: Float32Array, taken: number[], nouns: string[]): Float32Array {
+    this.#places ??= this.#found();
+    const isTaken = new Set(taken);
+    const result = scores.slice();
+    for (const { splats } of this.named(nouns).map((place) => this.#places![place])) {
+      if (splats.filter((i) => isTaken.has(i)).length < PIECE * splats.length) continue;
+      for (const i of splats) if (!isTaken.has(i)) result[i] = Math.max(result[i], MEMBER);
+    }
+    return result;
   }
 
   /** The places of the objects of which some splats are at least half. */

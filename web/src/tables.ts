@@ -229,12 +229,17 @@ export class Tables implements Source {
     const whole = this.segments.scores(own);
     if (!this.cuts) return { scores: whole, own, presence, threshold };
     const { words, held } = this.cuts;
+    const { grammar } = this.dictionary;
     const parts = isPartAlone(phrase, words) ? await this.#ofObjects(phrase, whole, this.segments, held) : null;
-    const scores = parts?.scores ?? (await this.#cut(phrase, own, whole, this.segments, this.cuts)) ?? whole;
+    let scores = parts?.scores ?? (await this.#cut(phrase, own, whole, this.segments, this.cuts)) ?? whole;
     const splats = this.#seen(scores, threshold, this.segments);
     const opacity = splats.reduce((sum, i) => sum + this.geometry.opacities[i], 0);
     if (splats.length && opacity < this.geometry.rule.evidence_faint * splats.length) return { scores: own, own, presence: "no" as const, threshold };
     const sure = this.#hasColor(phrase, splats, held) && parts?.presence !== "unsure";
+    if (presence === "yes" && sure && !this.#isQualified(phrase) && !isPart(phrase, words) && !isPartAlone(phrase, words)) {
+      const noun = phrase.toLowerCase().split(" of ")[0].split(" ").at(-1)!;
+      if (!grammar.has("stuff", noun)) scores = this.kinds.completed(scores, splats, singulars(noun));
+    }
     return { scores, own, ...parts, presence: presence === "yes" && !sure ? ("unsure" as const) : presence, threshold };
   }
 
@@ -253,6 +258,11 @@ export class Tables implements Source {
     if (!pairs.some(([a, b]) => (told.includes(a) && seen.includes(b)) || (told.includes(b) && seen.includes(a)))) return false;
     const whole = this.kinds.covered(splats).map((place) => this.kinds.entry(place)); // not only a part: a light belly
     return holding.some((entry) => whole.includes(entry) || told.some((color) => entry.colors?.includes(color)));
+  }
+
+  #isQualified(phrase: string): boolean {
+    const before = phrase.toLowerCase().split(" ").slice(0, -1);
+    return before.some((word) => this.dictionary.grammar.has("qualities", word));
   }
 
   /** The colors that a phrase tells of a thing. */

@@ -221,7 +221,11 @@ def _both(phrase: Both | Together, searched: Searched) -> Selection:
         for part, each in ((phrase.first, first), (phrase.second, second))
         if each.note or each.present == "no"
     ]
-    found = _united(first, second, colors_of_one=_is_one_noun(phrase))
+    one_noun = _is_one_noun(phrase)
+    if one_noun and isinstance(phrase, Both) and {first.present, second.present} == {"yes", "unsure"}:
+        # "Red or green apple": what is only perhaps a green one does not count beside a red one.
+        first, second = (each if each.present == "yes" else _joined(each, ()) for each in (first, second))
+    found = _united(first, second, colors_of_one=one_noun)
     if isinstance(phrase, Together):
         present = min(first.present, second.present, key=PRESENCES.index)
         found = replace(_joined(found, ()) if present == "no" else found, present=present)

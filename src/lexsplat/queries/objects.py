@@ -21,6 +21,8 @@ FITS = 0.6
 """Smallest strength of the name of an object, and of what a scene holds (`lexsplat.queries.presence`)."""
 _PART = 0.5
 """Smallest strength of that name at its parts."""
+_CLEARLY = 0.25
+"""A thing's name describes a piece in a surface clearly better if it is stronger by this."""
 _WHOLE = 0.75
 """A name describes a segment as a whole if it describes this share of what the views show of it."""
 _SLOPE = 12.0
@@ -81,6 +83,35 @@ def whole_segments(
         whole = (most[level] >= FITS) & (described[level] >= _WHOLE * codes.masses[level])
         places = np.where((places < 0) & whole, level, places)
     return WholeSegments(places, best)
+
+
+def pieces_of_others(
+    whole: WholeSegments,
+    lowest: IntArray,
+    known: IntArray,
+    strengths: FloatArray,
+    surfaces: NDArray[np.bool_],
+) -> IntArray:
+    """The thing of which a lowest segment in a surface may be a piece, such as a lamp's stand in the table behind it.
+
+    Args:
+        whole: The objects.
+        lowest: Number in 0..V-1 of each lowest segment ``[S]``.
+        known: Words of the objects ``[K]``, each once, sorted.
+        strengths: How well they describe each segment ``[V, K]``.
+        surfaces: Which of them are surfaces ``[K]``.
+
+    Returns:
+        The word that describes it best ``[S]``, where its object's word does not, or clearly worse; -1 elsewhere.
+    """
+    if surfaces.all():
+        return np.full_like(lowest, -1)
+    own = np.searchsorted(known, whole.words[np.maximum(whole.places, 0)]).clip(max=len(known) - 1)
+    here, things = strengths[lowest], np.flatnonzero(~surfaces)
+    best, most, least = here[:, things].argmax(1), here[:, things].max(1), here[np.arange(len(own)), own]
+    better = (most >= FITS) & ((least < _PART) | (most - least >= _CLEARLY))
+    moved = (whole.places >= 0) & surfaces[own] & better
+    return np.where(moved, known[things][best], -1)
 
 
 def name_probabilities(strengths: FloatArray) -> FloatArray:

@@ -19,37 +19,65 @@ _SMALLEST, _LARGEST = 0.05, 0.2
 _REACH = 1.5
 """Gaussians reach each other where they are at most this many of their standard deviations apart, that way."""
 _NEAREST = 4
+_TAIL = 0.02
+"""Share of the Gaussians of a surface on each side that do not tell how thick it is."""
+_ROUNDS = 4
+"""How often pieces of a surface join those that joined before."""
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
-def with_pieces(gaussians: Gaussians, labels: IntArray, opacities: FloatArray) -> IntArray:
+def with_pieces(
+    gaussians: Gaussians, labels: IntArray, opacities: FloatArray, *, surface: bool = False
+) -> IntArray:
     """Clusters, from those of `lexsplat.queries.touching`: pieces join the cluster that they reach.
 
     Args:
         gaussians: The M Gaussians.
         labels: The cluster of each ``[M]``, numbered from 0.
         opacities: Their opacities ``[M]``.
+        surface: Whether they are those of a surface, such as a table. The things on it divide what can be seen of it:
+            the smallest pieces count as well, and so do those that reach another piece.
 
     Returns:
         The cluster of each ``[M]``, numbered from 0.
     """
     totals = np.bincount(labels, opacities)
     shares = totals / max(totals.max(initial=0.0), 1e-12)
-    small = np.flatnonzero((shares >= _SMALLEST) & (shares < _LARGEST))
-    if len(small) == 0:
+    if len(totals) < 2:
         return labels
-    things, joined = np.flatnonzero((shares >= _LARGEST)[labels]), np.arange(len(shares))
-    for label in small:
-        near, apart = _apart(gaussians, np.flatnonzero(labels == label), things)
-        if apart.min() <= _REACH:
-            joined[label] = labels[near.flat[apart.argmin()]]
+    things = shares >= _LARGEST
+    pieces = ~things & (_level(gaussians, labels, int(totals.argmax())) if surface else shares >= _SMALLEST)
+    joined = np.arange(len(shares))
+    for _ in range(_ROUNDS if surface else 1):
+        members = np.flatnonzero(pieces[labels])
+        if len(members) == 0:
+            break
+        near, apart = _apart(gaussians, members, np.flatnonzero(things[labels]))
+        order = np.argsort(apart, kind="stable")
+        found, first = np.unique(labels[members[order]], return_index=True)
+        reached = apart[order[first]] <= _REACH
+        joined[found[reached]] = joined[labels[near[order[first[reached]]]]]
+        things, pieces = things.copy(), pieces.copy()
+        things[found[reached]], pieces[found[reached]] = True, False
+        if not reached.any():
+            break
     return np.unique(joined[labels], return_inverse=True)[1].astype(np.intp)
 
 
+def _level(gaussians: Gaussians, labels: IntArray, largest: int) -> NDArray[np.bool_]:
+    """Which clusters lie in the plane of the largest one, at most as far from it as that one is thick."""
+    means = gaussians.means.detach().cpu().double().numpy()
+    own = means[labels == largest]
+    normal = np.linalg.eigh(np.cov(own.T))[1][:, 0] if len(own) > 1 else np.zeros(3)
+    low, high = np.quantile(own @ normal, [_TAIL, 1 - _TAIL])
+    heights = np.bincount(labels, means @ normal) / np.bincount(labels)
+    return np.asarray(np.abs(heights - (low + high) / 2) <= 1.5 * (high - low))
+
+
 def _apart(gaussians: Gaussians, members: IntArray, others: IntArray) -> tuple[IntArray, FloatArray]:
-    """The nearest of some Gaussians ``[S, 4]`` to each of the members, and how many deviations they are apart."""
+    """The one of some Gaussians that each of the members reaches best ``[S]``, and how many deviations away it is."""
     means = gaussians.means.detach().cpu().double().numpy()
     count = min(_NEAREST, len(others))
     near = others[cKDTree(means[others]).query(means[members], k=range(1, count + 1))[1]]
@@ -58,7 +86,9 @@ def _apart(gaussians: Gaussians, members: IntArray, others: IntArray) -> tuple[I
     way = way / np.maximum(distances, 1e-12)[..., None]
     own = np.broadcast_to(members[:, None], near.shape)
     reach = _deviations(gaussians, own, way) + _deviations(gaussians, near, way)
-    return near, distances / np.maximum(reach, 1e-12)
+    apart = distances / np.maximum(reach, 1e-12)
+    best = apart.argmin(1)[:, None]
+    return np.take_along_axis(near, best, 1)[:, 0], np.take_along_axis(apart, best, 1)[:, 0]
 
 
 def _deviations(gaussians: Gaussians, index: IntArray, way: FloatArray) -> FloatArray:

@@ -28,6 +28,7 @@ from lexsplat.queries.clusters import LINK, clusters, spacing
 from lexsplat.queries.pieces import with_pieces
 from lexsplat.queries.places import given_length, place_of
 from lexsplat.queries.touching import divided
+from lexsplat.queries.vocabulary import DIVIDED
 from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.lazy import at_first_call
 
@@ -435,7 +436,8 @@ class Selection:
         firm = opacities >= FAINT
         counted = None if self.seen is None else self.seen.counted(self.indices)
         labels = divided(points, firm, clusters(points, firm, counted), self.up.direction)
-        labels = with_pieces(self.selected, labels, opacities)
+        surface = not DIVIDED.isdisjoint(self.phrase.lower().split()[-1:])
+        labels = with_pieces(self.selected, labels, opacities, surface=surface)
         return labels, np.bincount(labels, weights=opacities).astype(np.float64)
 
 

@@ -40,9 +40,11 @@ _MATERIALS = """
     clay, concrete, gold, silver, copper, steel, rust, wax, foam, paper, cardboard, stripes, checkered pattern,
     polka dots, text
 """
-_SURFACES = """
-    table, tablecloth, desk, cloth, wall, floor, ceiling, carpet, grass, road, sky, water, sand, stairs, wood, metal,
-    plastic, stone, brick, leaves, ground, window, door, curtain, fence, shelf, bed, hand, wheel
+_DIVIDED = """
+    table, tablecloth, desk, cloth, wall, floor, ceiling, carpet, grass, road, stairs, ground, shelf, bed
+"""
+_OTHER_SURFACES = """
+    sky, water, sand, wood, metal, plastic, stone, brick, leaves, window, door, curtain, fence, hand, wheel
 """
 
 
@@ -51,7 +53,9 @@ def words(text: str) -> list[str]:
     return [" ".join(entry.split()) for entry in text.split(",")]
 
 
-SURFACES = frozenset(words(_SURFACES))
+DIVIDED = frozenset(words(_DIVIDED))
+"""Names of surfaces that the things on them, or before them, divide into pieces."""
+SURFACES = DIVIDED | frozenset(words(_OTHER_SURFACES))
 """Names of surfaces, materials and parts: none of them is a "thing" when everything is asked for."""
 MATERIALS = frozenset(words(_MATERIALS))
 """Names of materials and patterns, which give way to the name of a thing."""

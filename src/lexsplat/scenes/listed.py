@@ -41,13 +41,17 @@ def mainly(scene: Scene, taken: Tensor) -> list[Selection]:
     return [each for each, shares in shared if shares >= _MOST * min(len(each), count)]
 
 
+def listed_under(scene: Scene, noun: str) -> list[Selection]:
+    """The objects of a scene whose names have a noun."""
+    return [each for each in scene.objects if noun in _nouns(each)]
+
+
 def listed_as(scene: Scene, phrase: str) -> list[Selection]:
     """The objects that a phrase names without its qualities: those of its noun, or else those that it selects.
 
     "Cloth" selects what is listed as a tablecloth, and so "white cloth" is that one.
     """
-    noun = noun_of(phrase)
-    if named := [each for each in scene.objects if noun in _nouns(each)]:
+    if named := listed_under(scene, noun_of(phrase)):
         return named
     for plain in dict.fromkeys((without_color(phrase), unqualified(phrase))):
         if plain and plain != phrase and not is_part(plain):

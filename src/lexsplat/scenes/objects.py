@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from lexsplat.queries.objects import name_probabilities, whole_segments
+from lexsplat.queries.objects import name_probabilities, pieces_of_others, whole_segments
 from lexsplat.queries.presence import FAINT
 from lexsplat.queries.relations import same
 from lexsplat.queries.relevancy import check_prompts
@@ -105,14 +105,24 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
         lambda part: classifier.strengths(texts[part], codes.distributions),
         [gives_way(word) for word in words],
     )
-    named = torch.from_numpy(np.where(whole.places < 0, -1, whole.words[whole.places])).to(segments.labels)
+    numbers = np.where(whole.places < 0, -1, whole.words[whole.places])
+    known = np.unique(numbers[numbers >= 0])
+    surfaces = np.array([words[number] in SURFACES for number in known], bool)
+    strengths = classifier.strengths(texts[known], codes.distributions)
+    others = pieces_of_others(whole, codes.numbers[0], known, strengths, surfaces)
+    named, pieces = (
+        torch.from_numpy(each).to(segments.labels)[segments.labels] for each in (numbers, others)
+    )
     found: list[Selection] = []
-    # Objects share no Gaussian, so they share scores.
+    # Objects share no Gaussian, so they share scores. Surfaces come last: pieces of things leave them.
     scores, shown = torch.zeros_like(segments.masses), ~scene.hidden
-    for number in named[named >= 0].unique().tolist():
-        mask, name = named[segments.labels] == number, words[number]
-        both = scene.selection(mask, scores, phrase=name)
+    for number in [*known[~surfaces].tolist(), *known[surfaces].tolist()]:
+        mask, name = named == number, words[number]
+        both = scene.selection(mask | (pieces == number), scores, phrase=name)
         for each in [both] if name in STUFF else both.instances:
+            if not bool(mask[each.indices].any()):
+                continue
+            named[each.indices] = number
             each = each.within(shown)
             if (
                 each and float(scene.gaussians.opacities[each.indices].mean()) >= FAINT

@@ -21,12 +21,12 @@ from lexsplat.queries.parts import FEWEST, part_scores, with_parts
 from lexsplat.queries.presence import FAINT
 from lexsplat.queries.relevancy import gaussian_relevancy
 from lexsplat.queries.scoring import form_used, scores_in_form
-from lexsplat.queries.selection import Presence, Selection
+from lexsplat.queries.selection import Presence, Selection, union
 from lexsplat.queries.thresholds import BORDER
 from lexsplat.queries.vocabulary import STUFF, SURFACES, is_part, is_part_alone, part_named, thing_of_part
 from lexsplat.runtime.device import threads_for_kernels
 from lexsplat.scenes.gone import gone_nouns, noun_of
-from lexsplat.scenes.listed import doubt, holding, listed_as
+from lexsplat.scenes.listed import doubt, holding, listed_as, listed_under
 from lexsplat.scenes.pixels import object_colors, seen_colors
 
 if TYPE_CHECKING:
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 MEMBER = 0.9
 """Score of an object that is the answer, where language has less: at the border itself, masks stay empty."""
+_PIECE = 0.3
+"""Share of an object of its name from which a word is that object."""
 _PER_THREAD = 100_000
 """Gaussians for each thread of torch: with fewer, waiting for each other costs more than it saves."""
 
@@ -82,6 +84,7 @@ def with_objects(scene: Scene, prompt: str, word: Word) -> Word:
         return replace(word, scores=word.own, presence="no", note=f"an edit took the {noun} away")
     with _few_threads(scene):
         word = of_qualities(scene, prompt, of_part(scene, prompt, of_kind(scene, prompt, word)))
+        word = completed(scene, prompt, word)
         return noted(scene, prompt, _if_visible(scene, word))
 
 
@@ -115,6 +118,27 @@ def members_of_kind(scene: Scene, prompt: str) -> list[Selection]:
     if scene.query.fixed or not is_kind(prompt):
         return []
     return [each for each in scene.objects if is_of_kind(each.phrase, prompt)]
+
+
+def completed(scene: Scene, prompt: str, word: Word) -> Word:
+    """The word with all of each object of its name of which it takes at least `_PIECE`.
+
+    The widest gap between the scores of segments may lie within a thing of many looks, such as a stack of books. The
+    list of objects knows its other segments by name: no other word describes them better.
+    """
+    if word.presence != "yes" or word.members or form_used(scene.field, scene.query) != "segment":
+        return word
+    if scene.query.fixed or is_qualified(prompt) or is_part(prompt) or is_part_alone(prompt):
+        return word
+    taken, named = (word.scores >= BORDER) & ~scene.hidden, listed_under(scene, noun_of(prompt))
+    found = [
+        each
+        for each in named
+        if each.phrase not in STUFF and int(taken[each.indices].sum()) >= _PIECE * len(each)
+    ]
+    added = union(taken, found) & ~taken
+    scores = torch.where(added, word.scores.clamp(min=MEMBER), word.scores)
+    return replace(word, scores=scores) if bool(added.any()) else word
 
 
 def of_part(scene: Scene, prompt: str, word: Word) -> Word:
