@@ -7,7 +7,6 @@ import shutil
 from pathlib import Path
 
 import pytest
-import torch
 
 from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.gone import gone_nouns, noun_of
