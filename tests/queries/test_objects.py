@@ -134,7 +134,9 @@ def test_a_segment_of_a_surface_that_a_thing_names_better_may_be_its_piece():
     assert pieces_of_others(whole, lowest, known, table, surfaces).tolist() == [-1, 1, -1, -1, -1]
     assert pieces_of_others(whole, lowest, known, table, ~surfaces).tolist() == [-1] * 5, "the lamp is a lamp"
     table[1] = 0.6, 0.9
-    assert pieces_of_others(whole, lowest, known, table, surfaces)[1] == 1, "the lamp's name fits clearly better"
+    assert pieces_of_others(whole, lowest, known, table, surfaces)[1] == 1, (
+        "the lamp's name fits clearly better"
+    )
     table[1] = 0.7, 0.9
     assert (pieces_of_others(whole, lowest, known, table, surfaces) < 0).all(), "the table's name fits, too"
     table[1] = 0.1, 0.5
