@@ -59,15 +59,26 @@ export class Kinds {
     return [...this.#objects.keys()].filter((place) => isOne(this.#objects[place].name));
   }
 
-  /** Scores with all of each object with a noun of which some splats are taken (completed in lexsplat.scenes.words). */
-  completed(scores: Float32Array, taken: number[], nouns: string[]): Float32Array {
+  /**
+   * Scores with all of each object with a noun of which some splats are taken, and without the little that they take
+   * of other things (completed in lexsplat.scenes.words).
+   */
+  completed(scores: Float32Array, taken: number[], nouns: string[], isSurface: (name: string) => boolean): Float32Array {
     this.#places ??= this.#found();
     const isTaken = new Set(taken);
+    const named = new Set(this.named(nouns));
+    const isMuch = (splats: number[]): boolean => splats.filter((i) => isTaken.has(i)).length >= PIECE * splats.length;
+    const found = [...named].filter((place) => isMuch(this.#places![place].splats));
+    if (found.length === 0) return scores;
     const result = scores.slice();
-    for (const { splats } of this.named(nouns).map((place) => this.#places![place])) {
-      if (splats.filter((i) => isTaken.has(i)).length < PIECE * splats.length) continue;
-      for (const i of splats) if (!isTaken.has(i)) result[i] = Math.max(result[i], MEMBER);
+    const border = this.geometry.rule.threshold - 1e-4;
+    for (const place of found) {
+      for (const i of this.#places[place].splats) if (!isTaken.has(i)) result[i] = Math.max(result[i], MEMBER);
     }
+    this.#places.forEach(({ splats }, place) => {
+      if (named.has(place) || isSurface(this.#objects[place].name) || isMuch(splats)) return;
+      for (const i of splats) if (isTaken.has(i)) result[i] = Math.min(result[i], border);
+    });
     return result;
   }
 

@@ -238,7 +238,7 @@ export class Tables implements Source {
     const sure = this.#hasColor(phrase, splats, held) && parts?.presence !== "unsure";
     if (presence === "yes" && sure && !this.#isQualified(phrase) && !isPart(phrase, words) && !isPartAlone(phrase, words)) {
       const noun = phrase.toLowerCase().split(" of ")[0].split(" ").at(-1)!;
-      if (!grammar.has("stuff", noun)) scores = this.kinds.completed(scores, splats, singulars(noun));
+      if (!grammar.has("stuff", noun)) scores = this.kinds.completed(scores, splats, singulars(noun), (name) => grammar.has("surfaces", name));
     }
     return { scores, own, ...parts, presence: presence === "yes" && !sure ? ("unsure" as const) : presence, threshold };
   }

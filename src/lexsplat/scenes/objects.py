@@ -107,6 +107,8 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     )
     numbers = np.where(whole.places < 0, -1, whole.words[whole.places])
     known = np.unique(numbers[numbers >= 0])
+    if len(known) == 0:
+        return ()
     surfaces = np.array([words[number] in SURFACES for number in known], bool)
     strengths = classifier.strengths(texts[known], codes.distributions)
     others = pieces_of_others(whole, codes.numbers[0], known, strengths, surfaces)

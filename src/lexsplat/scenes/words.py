@@ -124,7 +124,8 @@ def completed(scene: Scene, prompt: str, word: Word) -> Word:
     """The word with all of each object of its name of which it takes at least `_PIECE`.
 
     The widest gap between the scores of segments may lie within a thing of many looks, such as a stack of books. The
-    list of objects knows its other segments by name: no other word describes them better.
+    list of objects knows its other segments by name: no other word describes them better. So it knows those of other
+    things, of which the word takes a little.
     """
     if word.presence != "yes" or word.members or form_used(scene.field, scene.query) != "segment":
         return word
@@ -136,9 +137,18 @@ def completed(scene: Scene, prompt: str, word: Word) -> Word:
         for each in named
         if each.phrase not in STUFF and int(taken[each.indices].sum()) >= _PIECE * len(each)
     ]
-    added = union(taken, found) & ~taken
-    scores = torch.where(added, word.scores.clamp(min=MEMBER), word.scores)
-    return replace(word, scores=scores) if bool(added.any()) else word
+    if not found:
+        return word
+    whole = union(taken, found)
+    others = [each for each in scene.objects if each not in named and _is_scrap(each, taken)]
+    scores = torch.where(whole & ~taken, word.scores.clamp(min=MEMBER), word.scores)
+    scores = torch.where(union(taken, others) & taken, scores.clamp(max=BORDER - 1e-4), scores)
+    return replace(word, scores=scores)
+
+
+def _is_scrap(other: Selection, taken: Tensor) -> bool:
+    """Whether a word takes a little of another thing, such as the upper edge of the books before a lamp."""
+    return other.phrase not in SURFACES and 0 < int(taken[other.indices].sum()) < _PIECE * len(other)
 
 
 def of_part(scene: Scene, prompt: str, word: Word) -> Word:
