@@ -174,11 +174,14 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def tab(browser):
-    """A page for `page_browser.show`, one after another: it starts faster than new ones."""
+def tab(browser, request):
+    """A page for `page_browser.show`, one after another: it starts faster than new ones.
+
+    A module's ``PIXEL_SCALE`` is its number of pixels of the screen for one of the page.
+    """
     from support.page_browser import blank_page
 
-    page = blank_page(browser)
+    page = blank_page(browser, scale=getattr(request.module, "PIXEL_SCALE", 1.0))
     yield page
     page.close()
 
