@@ -136,6 +136,26 @@ def color_encoders() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
+def own_size_features() -> Iterator[None]:
+    """SIFT that starts at the size of a photo instead of twice of it: a third of the time, enough for `rooms`.
+
+    The stages under a memory limit (`limited_stages`) register the same photos with the features of the product.
+    """
+    import pycolmap
+
+    make = pycolmap.FeatureExtractionOptions
+
+    def options(**given):
+        made = make(**given)
+        made.sift.first_octave = 0
+        return made
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pycolmap, "FeatureExtractionOptions", options)
+        yield
+
+
+@pytest.fixture(scope="module")
 def clip_folder(tmp_path_factory) -> Path:
     """A tiny CLIP with random weights, saved the way the Hub's are."""
     from support.encoder_folders import write_clip
@@ -154,11 +174,14 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def tab(browser):
-    """A page for `page_browser.show`, one after another: it starts faster than new ones."""
+def tab(browser, request):
+    """A page for `page_browser.show`, one after another: it starts faster than new ones.
+
+    A module's ``PIXEL_SCALE`` is its number of pixels of the screen for one of the page.
+    """
     from support.page_browser import blank_page
 
-    page = blank_page(browser)
+    page = blank_page(browser, scale=getattr(request.module, "PIXEL_SCALE", 1.0))
     yield page
     page.close()
 

@@ -28,7 +28,7 @@ from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
 from lexsplat.geometry.cameras import look_at
 from lexsplat.runtime.errors import CaptureError
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_size_features")]
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_photos_of_several_sizes_and_lenses_all_have_features(tmp_path):
             each.name: opened.num_keypoints_for_image(each.image_id) for each in opened.read_all_images()
         }
     assert sorted(counts) == [f"{index}.png" for index in range(6)]
-    assert min(counts.values()) > 100, counts
+    assert min(counts.values()) > 30, counts  # of the photos of half the size
 
 
 def test_each_unregistered_photo_has_its_reason(room, tmp_path):

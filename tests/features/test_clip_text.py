@@ -96,12 +96,12 @@ def test_the_light_tower_reads_the_names_of_open_clip_and_half_precision(clip_fo
     assert_same_embeddings(copy, model.half().float())
 
 
-def test_the_light_tower_equals_transformers_at_the_size_of_vit_b_16(clip_folder, tmp_path):
+def test_the_light_tower_equals_transformers_at_the_width_of_vit_b_16(clip_folder, tmp_path):
     from transformers import CLIPConfig, CLIPModel
 
     config = CLIPConfig.from_pretrained(clip_folder)
     config.text_config.update({
-        "hidden_size": 512, "intermediate_size": 2048, "num_hidden_layers": 12, "num_attention_heads": 8,
+        "hidden_size": 512, "intermediate_size": 2048, "num_hidden_layers": 3, "num_attention_heads": 8,
         "max_position_embeddings": 77, "hidden_act": "gelu",
     })  # fmt: skip
     config.projection_dim = 512

@@ -99,11 +99,14 @@ def test_clip_image_embeddings_equal_transformers_own(clip_folder):
     ("activation", "size"), [("quick_gelu", 24), ("gelu", 24), ("relu", 24), ("gelu", 72)]
 )
 def test_the_image_tower_equals_transformers_own(activation, size):
-    from transformers import CLIPConfig, CLIPModel, CLIPVisionConfig
+    from transformers import CLIPConfig, CLIPModel, CLIPTextConfig, CLIPVisionConfig
 
     vision = {"hidden_size": 24, "intermediate_size": 40, "num_attention_heads": 3, "num_hidden_layers": 3}
     vision |= {"image_size": size, "patch_size": 8, "hidden_act": activation}
-    config = CLIPConfig(vision_config=CLIPVisionConfig(**vision).to_dict(), projection_dim=16)
+    text = CLIPTextConfig(vocab_size=9, hidden_size=8, num_attention_heads=1, num_hidden_layers=1)  # not used
+    config = CLIPConfig(
+        text_config=text.to_dict(), vision_config=CLIPVisionConfig(**vision).to_dict(), projection_dim=16
+    )
     model = seeded(lambda: CLIPModel(config))
     pixels = torch.randn(3, 3, size, size)
     with torch.no_grad():

@@ -26,7 +26,7 @@ UP = np.array([0.0, 0.0, 1.0])
 @pytest.fixture(autouse=True)
 def _few_looks(monkeypatch) -> None:
     """Half as many looks from above and around as usual."""
-    monkeypatch.setattr(candidates, "_AZIMUTHS", 8)
+    monkeypatch.setattr(candidates, "_AZIMUTHS", 4)
 
 
 def dusty() -> tuple[Gaussians, Gaussians]:

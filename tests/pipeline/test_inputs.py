@@ -28,7 +28,7 @@ from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.progress import Event
 from lexsplat.scenes.folder import SceneFolder
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_size_features")]
 
 QUICK = ["--device", "cpu", "--iterations", "2", "--downscale", "4", "--poses.max-features", str(FEW)]
 

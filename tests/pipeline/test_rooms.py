@@ -29,7 +29,8 @@ ALL, NO_CEILING, NO_FRONT = (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4), (0, 1, 3, 4, 5)
 @pytest.fixture(autouse=True)
 def _few_looks(monkeypatch) -> None:
     """Half as many looks from above and around as usual."""
-    monkeypatch.setattr(candidates, "_AZIMUTHS", 8)
+    monkeypatch.setattr(candidates, "_AZIMUTHS", 4)
+    monkeypatch.setattr(candidates, "_MOST_PLACES", 12)
 
 
 def box(low, high, count: int, seed: int, sides=ALL) -> np.ndarray:

@@ -14,7 +14,7 @@ from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.splats import existing_splats, splats_hash, with_filter_of_photos
-from lexsplat.pipeline.viewpoints import choosing
+from lexsplat.pipeline.viewpoints import candidates, choosing
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.progress import NOTE
@@ -66,7 +66,10 @@ def test_sizes_of_zero_are_a_warning_and_refused_where_most_gaussians_are_points
 
 @pytest.mark.slow
 def test_a_build_warns_once_of_what_it_drops_and_keeps_the_warning(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(choosing, "SIZE", (240, 180))
     monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 30)
+    monkeypatch.setattr(candidates, "_MOST_PLACES", 5)
+    monkeypatch.setattr(candidates, "_AZIMUTHS", 6)
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (3000, 3)) * [1.5, 1.5, 0.002]
     points[:800, 2] += 0.3 - 0.3 * (points[:800, :2] ** 2).sum(1)  # a hill on the ground

@@ -85,7 +85,10 @@ def test_a_guessed_up_direction_stays_a_guess_in_the_scene_with_its_warning(tmp_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("thing", ["teddy bear", "red apple"])
-def test_the_up_direction_of_a_thing_alone_is_a_guess_and_contradicts_nobody(tmp_path, thing, caplog):
+def test_the_up_direction_of_a_thing_alone_is_a_guess_and_contradicts_nobody(
+    tmp_path, thing, caplog, monkeypatch
+):
+    monkeypatch.setattr(candidates, "_AZIMUTHS", 4)
     cli.main(["export", "demo", str(tmp_path / "thing.ply"), "--select", thing])
     gaussians = read_splats(tmp_path / "thing.ply")
     with caplog.at_level(logging.WARNING, "lexsplat"):

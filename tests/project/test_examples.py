@@ -59,7 +59,7 @@ def test_04_labels_the_right_gaussians(run, tmp_path):
 
 
 def test_05_builds_a_scene(run, tmp_path):
-    write_capture(tmp_path / "capture", views=3)
+    write_capture(tmp_path / "capture", views=2)
     output = run("05_build.py", "capture", "scene", 20)
     assert "reconstruct: 20 of 20" in output
     assert "blue ball: present" in output

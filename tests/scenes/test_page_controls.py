@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from support.page_browser import CHROMIUM, ask, covered_tools, open_page, serving, show, until
+from support.page_browser import CHROMIUM, HALF, ask, covered_tools, open_page, serving, show, until
 from support.viewer_scene import ball_scene
 
 from lexsplat.scenes.publishing import PublishOptions, publish, vocabulary
 from lexsplat.viewer.history import MAX_LENGTH
 
+PIXEL_SCALE = HALF
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
 
 SMALL = ((667, 375), (740, 360), (800, 360), (390, 667), (360, 640), (390, 844))
@@ -37,7 +38,7 @@ def address(tmp_path_factory) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def opened(browser, address) -> Iterator[Any]:
-    page = open_page(browser, address, 720, 480)
+    page = open_page(browser, address, 720, 480, scale=HALF)
     yield page
     page.close()
 
@@ -53,7 +54,7 @@ def cleared(opened) -> Any:
 
 
 def test_on_a_phone_the_keyboard_and_the_panels_go_away_after_a_choice(browser, address):
-    page = open_page(browser, address, 390, 844, phone=True)
+    page = open_page(browser, address, 390, 844, phone=True, scale=HALF)
     until(page, "lexsplat.app.source !== null")
     focused = "document.activeElement.tagName"
     page.tap(".search input")
@@ -176,7 +177,7 @@ def test_links_that_ask_for_heat_press_its_tool_and_far_cameras_still_see_the_sc
 
 def test_a_page_that_draws_nothing_answers_all_the_same(browser, address):
     """A page in a tab behind others draws no picture."""
-    page = open_page(browser, address, script="window.requestAnimationFrame = () => 0")
+    page = open_page(browser, address, script="window.requestAnimationFrame = () => 0", scale=HALF)
     assert (
         page.evaluate("lexsplat.app.ask('ball 2', false, false).then(() => lexsplat.app.answers.length)") == 1
     )

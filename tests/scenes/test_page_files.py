@@ -10,7 +10,7 @@ import pytest
 import torch
 from support.encoder_folders import write_clip
 from support.language_scene import CENTERS
-from support.page_browser import CHROMIUM, ask, open_page, picture, serving, show, until
+from support.page_browser import CHROMIUM, HALF, ask, open_page, picture, serving, show, until
 from support.siglip_folder import siglip_folder
 from support.viewer_scene import ball_scene
 
@@ -21,6 +21,7 @@ from lexsplat.scenes.publishing import PublishOptions, publish, splat_file, voca
 from lexsplat.scenes.publishing.manifest import checksums
 from lexsplat.scenes.publishing.sidecar import segment_rule
 
+PIXEL_SCALE = HALF
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
 
 HOSTILE = "<img src=x onerror='window.pwned=1'></script><script>window.pwned=1</script>\"'{{TITLE}}"
@@ -326,7 +327,9 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(
         page = show(tab, address)
         assert page.locator(".failure").inner_text().startswith("page.wasm: expected WebAssembly")
     with serving(folder) as address:
-        page = open_page(browser, address, script="HTMLCanvasElement.prototype.getContext = () => null")
+        page = open_page(
+            browser, address, script="HTMLCanvasElement.prototype.getContext = () => null", scale=HALF
+        )
         assert "needs WebGL 2" in page.locator(".failure").inner_text()
         page.close()
 

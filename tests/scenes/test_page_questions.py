@@ -7,12 +7,13 @@ from typing import Any
 
 import pytest
 from questions import questions
-from support.page_browser import CHROMIUM, ask, open_page, serving, until
+from support.page_browser import CHROMIUM, HALF, ask, open_page, serving, until
 
 from lexsplat.queries.phrases import Anything, Both, Colored, Thing, Together, parts_of
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.scene import Scene, open_scene
 
+PIXEL_SCALE = HALF
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
 
 SINGLE = (
@@ -70,7 +71,7 @@ def demo() -> Scene:
 @pytest.fixture(scope="module")
 def page(browser, light_demo) -> Iterator[Any]:
     with serving(light_demo) as address:
-        yield open_page(browser, address, 900, 600)
+        yield open_page(browser, address, 900, 600, scale=HALF)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from support.rooms import SIZE, room_cameras, room_photo
 LARGE = (2400, 1800)
 GIANT = (3600, 2700)
 SIDE = SIZE[0]
-FEATURES = 800
+FEATURES = 400
 SAMPLE, DIMENSIONS, CODES = 40_000, 512, 8
 SLACK = 32 << 20
 """What may be resident beyond the numbers of `lexsplat.runtime.memory`: heaps not given back, code that is loaded."""

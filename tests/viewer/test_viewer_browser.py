@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 from plyfile import PlyData
-from support.page_browser import CHROMIUM, ask, covered_tools, open_page, show, until
+from support.page_browser import CHROMIUM, HALF, ask, covered_tools, open_page, show, until
 from support.viewer_scene import WORDS, ball_scene
 
 from lexsplat.viewer.history import MAX_LENGTH, History
 from lexsplat.viewer.server import ViewerConfig, ViewerServer
 
+PIXEL_SCALE = HALF
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
 
 PIXELS = """(points) => points.map((point) => {
@@ -54,7 +55,7 @@ def shared_viewer() -> Iterator[ViewerServer]:
 @pytest.fixture(scope="module")
 def shared_page(browser, shared_viewer) -> Iterator[Any]:
     """A page for tests that edit nothing."""
-    opened = open_page(browser, f"{shared_viewer.url}/#view=view0", 720, 480)
+    opened = open_page(browser, f"{shared_viewer.url}/#view=view0", 720, 480, scale=HALF)
     yield opened
     opened.close()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -71,14 +71,14 @@ def colmap_binary() -> Reader:
     names = ("cameras.bin", "images.bin", "points3D.bin")
     return Reader(
         make_colmap, load, check_capture,
-        {f"sparse/0/{name}": lambda content, rng: mutate.binary(content, rng, 50) for name in names}
+        {f"sparse/0/{name}": lambda content, rng: mutate.binary(content, rng, 40, 250) for name in names}
         | {"sparse/0/images.bin": colmap_images},
         exact=tuple(f"sparse/0/{name}" for name in names),
     )  # fmt: skip
 
 
 def colmap_images(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-    yield from mutate.binary(content, rng, 70)
+    yield from mutate.binary(content, rng, 50, 250)
     for name in (*mutate.NAMES, "c.png", "дом/b.png", "./c.png", "дом//b.png", "дом/../c.png"):
         raw = name.encode("utf-8", "surrogatepass")
         yield "names", content.replace(b"a.png\0", raw + b"\0")
@@ -89,7 +89,7 @@ def colmap_text() -> Reader:
     names = ("cameras.txt", "images.txt", "points3D.txt")
     return Reader(
         make_colmap_text, load, check_capture,
-        {f"sparse/0/{name}": lambda content, rng: mutate.text(content, rng, 60) for name in names},
+        {f"sparse/0/{name}": lambda content, rng: mutate.text(content, rng, 40, 150) for name in names},
     )  # fmt: skip
 
 
@@ -105,7 +105,7 @@ def make_transforms(folder: Path) -> None:
 @reader
 def transforms() -> Reader:
     return Reader(make_transforms, load, check_capture,
-                  {"transforms.json": lambda content, rng: mutate.json_file(content, rng, 60, 450)})  # fmt: skip
+                  {"transforms.json": lambda content, rng: mutate.json_file(content, rng, 60, 350)})  # fmt: skip
 
 
 def make_split(folder: Path) -> None:
@@ -126,17 +126,28 @@ def make_masks(folder: Path) -> None:
         picture(folder / "segmentations" / "a" / f"{prompt}.png", value=255, mode="L")
 
 
-def read_ground_truth(folder: Path) -> Any:
-    from lexsplat.captures import load_annotations, load_capture
-    from lexsplat.captures.ground_truth.layouts import load_ground_truth
+def ground_truth_of(
+    write: Callable[[Path], None], mutations: dict[str, Any], exact: tuple[str, ...] = ()
+) -> Reader:
+    """The ground truth of a capture that is loaded once: of ground truth, loading reads names of files only."""
+    kept: dict[str, Any] = {}
 
-    capture = load_capture(folder)
-    ground_truth = load_annotations(capture)
-    return ground_truth, [
-        load_ground_truth(capture.views[view], mask)
-        for view, masks in ground_truth.masks.items()
-        for mask in masks.values()
-    ]
+    def make(folder: Path) -> None:
+        write(folder)
+        kept["capture"] = load(folder)
+
+    def read(folder: Path) -> Any:
+        from lexsplat.captures import load_annotations
+        from lexsplat.captures.ground_truth.layouts import load_ground_truth
+
+        ground_truth = load_annotations(kept["capture"])
+        return ground_truth, [
+            load_ground_truth(kept["capture"].views[view], mask)
+            for view, masks in ground_truth.masks.items()
+            for mask in masks.values()
+        ]
+
+    return Reader(make, read, check_ground_truth, mutations, exact)
 
 
 def check_ground_truth(result: Any) -> None:
@@ -149,9 +160,7 @@ def check_ground_truth(result: Any) -> None:
 @reader
 def masks() -> Reader:
     name = "segmentations/a/red apple.png"
-    return Reader(
-        make_masks, read_ground_truth, check_ground_truth, {name: lambda c, r: png(c, r, 50)}, exact=(name,)
-    )
+    return ground_truth_of(make_masks, {name: lambda c, r: png(c, r, 50)}, exact=(name,))
 
 
 def make_ovs3d(folder: Path) -> None:
@@ -166,7 +175,7 @@ def ovs3d() -> Reader:
         for name in mutate.NAMES:
             yield "names", content + name.encode("utf-8", "surrogatepass") + b"\n"
 
-    return Reader(make_ovs3d, read_ground_truth, check_ground_truth, {"segmentations/classes.txt": lists})
+    return ground_truth_of(make_ovs3d, {"segmentations/classes.txt": lists})
 
 
 def make_lerf(folder: Path) -> None:
@@ -184,8 +193,9 @@ def make_lerf(folder: Path) -> None:
 
 @reader
 def lerf_ovs() -> Reader:
-    return Reader(make_lerf, read_ground_truth, check_ground_truth,
-                  {"label/frame_00001.json": lambda c, r: mutate.json_file(c, r, 40, 180)})  # fmt: skip
+    return ground_truth_of(
+        make_lerf, {"label/frame_00001.json": lambda c, r: mutate.json_file(c, r, 40, 180)}
+    )
 
 
 @reader

@@ -117,8 +117,8 @@ def feature_cache() -> Reader:
         assert result[2].shape[:2] == (2, 4)
 
     def changes(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-        yield from mutate.safetensors(content, rng, 40, 120)
-        yield from mutate.tensors(content, rng, 60)
+        yield from mutate.safetensors(content, rng, 30, 80)
+        yield from mutate.tensors(content, rng, 40)
 
     return Reader(make, read, check, {"crops": changes, "grid": changes})
 

@@ -62,5 +62,5 @@ def reconstruction_checkpoints() -> Reader:
 
     return Reader(
         make, read, check,
-        {"state": lambda c, rng: [*mutate.safetensors(c, rng, 30, 80), *mutate.tensors(c, rng, 80)]},
+        {"state": lambda c, rng: [*mutate.safetensors(c, rng, 20, 50), *mutate.tensors(c, rng, 50)]},
     )  # fmt: skip

@@ -69,8 +69,8 @@ def scene_folder() -> Reader:
     return Reader(
         make_folder, open_folder, check_open_scene,
         {
-            "scene.json": lambda content, rng: mutate.json_file(content, rng, 40, 180),
-            "cameras.json": lambda content, rng: mutate.json_file(content, rng, 40, 180),
+            "scene.json": lambda content, rng: mutate.json_file(content, rng, 30, 120),
+            "cameras.json": lambda content, rng: mutate.json_file(content, rng, 30, 120),
             "gaussians.ply": lambda content, rng: mutate.binary(content, rng, 40, 60),
             "language.safetensors": language_file,
         },
@@ -79,15 +79,15 @@ def scene_folder() -> Reader:
 
 
 def language_file(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-    yield from mutate.safetensors(content, rng, 50, 120)
-    yield from mutate.tensors(content, rng, 80)
+    yield from mutate.safetensors(content, rng, 40, 80)
+    yield from mutate.tensors(content, rng, 60)
 
 
 @reader
 def trained_scene_folder() -> Reader:
     return Reader(
         lambda folder: make_folder(folder, trained=True), open_folder, check_open_scene,
-        {"language.safetensors": lambda content, rng: mutate.tensors(content, rng, 100)},
+        {"language.safetensors": lambda content, rng: mutate.tensors(content, rng, 60)},
     )  # fmt: skip
 
 

@@ -59,8 +59,8 @@ def splat_ply() -> Reader:
 
     def headers(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
         end = content.index(b"end_header\n") + 11
-        yield from mutate.binary(content, rng, 150, 500)
-        yield from mutate.overwritten(content, rng, 150, start=end)
+        yield from mutate.binary(content, rng, 120, 300)
+        yield from mutate.overwritten(content, rng, 120, start=end)
         for kind, changed in mutate.text(content[:end], rng, 120, 0):
             yield kind, changed + content[end:]
         for count in (5, 10**6, 10**9, 2**63, 10**30):
@@ -231,11 +231,11 @@ def sog_folder() -> Reader:
             archive.extractall(folder)
 
     def picture(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-        yield from mutate.binary(content, rng, 16, 20)
+        yield from mutate.binary(content, rng, 12, 16)
 
     names = ("means_l", "means_u", "quats", "scales", "sh0", "shN_centroids", "shN_labels")
     parts = {f"{name}.webp": picture for name in names}
-    parts["meta.json"] = lambda content, rng: mutate.json_file(content, rng, 40, 300)
+    parts["meta.json"] = lambda content, rng: mutate.json_file(content, rng, 40, 150)
     return SplatReader(make, read_splats, check_gaussians, parts)
 
 
@@ -250,7 +250,7 @@ def sog_version_1() -> Reader:
     }
 
     def counts(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-        yield from mutate.json_file(content, rng, 40, 250)
+        yield from mutate.json_file(content, rng, 40, 150)
         document = json.loads(content)
         for count in (*range(10), 11, 12):
             document["means"]["shape"] = [count, 3]
@@ -271,7 +271,7 @@ def sog_streamed() -> Reader:
     return SplatReader(
         lambda folder: write_streamed(folder, {"0_0": 10, "1_0": 5}, tree),
         read_splats, check_gaussians,
-        {"lod-meta.json": lambda content, rng: mutate.json_file(content, rng, 80, 600)},
+        {"lod-meta.json": lambda content, rng: mutate.json_file(content, rng, 80, 350)},
     )  # fmt: skip
 
 
@@ -281,11 +281,11 @@ def glb() -> Reader:
     from lexsplat.scenes.formats.reading import read_splats
 
     def mutations(content: bytes, rng: np.random.Generator) -> Iterator[mutate.Mutation]:
-        yield from mutate.binary(content, rng, 150, 300)
+        yield from mutate.binary(content, rng, 120, 200)
         (length,) = struct.unpack_from("<I", content, 12)
         document, binary = json.loads(content[20 : 20 + length]), content[20 + length :]
         document["asset"]["generator"] = "another"  # so that its nodes count
-        for kind, text in mutate.structure(document, rng, 1000):
+        for kind, text in mutate.structure(document, rng, 400):
             text += b" " * (-len(text) % 4)
             head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(binary), len(text), b"JSON")
             yield kind, head + text + binary
@@ -319,7 +319,7 @@ def gltf() -> Reader:
         (folder / "a.glb").unlink()
 
     parts = {
-        "a.gltf": lambda content, rng: mutate.json_file(content, rng, 60, 500),
+        "a.gltf": lambda content, rng: mutate.json_file(content, rng, 60, 250),
         "a.bin": lambda content, rng: mutate.binary(content, rng, 60, 100),
     }
     return SplatReader(make, lambda folder: read_splats(folder / "a.gltf"), check_gaussians, parts)
