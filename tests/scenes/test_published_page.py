@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import binary_erosion
-from support.page_browser import CHROMIUM, ask, open_page, picture, serving, show, until
+from support.page_browser import CHROMIUM, HALF, ask, open_page, picture, serving, show, until
 
 from lexsplat.queries.vocabulary import COLORS, is_part_alone, thing_of_part
 from lexsplat.rendering import render
@@ -38,6 +38,7 @@ PROMPTS = (
     "zebra",  # not in the scene
     "qwzx blorp",
 )
+PIXEL_SCALE = HALF
 SIZE = (664, 498)
 """Of a window in which nothing covers the picture's bottom, with the sides of the demo's photos."""
 
@@ -55,7 +56,7 @@ def address(light_demo) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def page(browser, address) -> Iterator[Any]:
-    opened = open_page(browser, address)
+    opened = open_page(browser, address, scale=HALF)
     yield opened
     opened.close()
 

@@ -49,6 +49,8 @@ def main() -> None:
             scene = open_scene(work, device="cpu")
             keep(scene)
             quality = evaluate_scene(scene, listener=bars)
+            scene.ask("red apple", checked=True)  # asks for the names of its things in all colors
+            scene.write_texts()
         BUNDLED_SCENE.mkdir(parents=True, exist_ok=True)
         texts = (
             Path("checkpoints") / "texts"
