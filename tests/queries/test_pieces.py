@@ -66,3 +66,20 @@ def test_pieces_of_a_surface_join_it_however_small_and_those_join_that_reach_ano
     assert with_pieces(*table(gap=0.3)).tolist() == [0] * 400 + [1, 2, 3]
     assert with_pieces(*table(gap=0.3), surface=True).tolist() == [0] * 402 + [1]
     assert with_pieces(*table(gap=0.6), surface=True).tolist() == [0] * 401 + [1, 2]
+
+
+@pytest.mark.parametrize(("count", "joins"), [(24, True), (8, False)], ids=["a leg", "a speck"])
+def test_a_leg_of_a_table_joins_it_as_it_joins_other_things_and_a_speck_below_does_not(count, joins):
+    top = np.c_[np.random.default_rng(0).uniform(0, 1, (400, 2)), np.zeros(400)]
+    leg = np.c_[np.full((count, 2), 0.5), -0.05 - 0.05 * np.arange(count)]
+    points = np.concatenate([top, leg])
+    gaussians = gaussians_from_points(points, np.full((len(points), 3), 0.5), sh_degree=0, opacity=0.8)
+    gaussians.log_scales.fill_(np.log(0.03))
+    labels = np.repeat([0, 1], [400, count])
+    joined = with_pieces(gaussians, labels, np.full(len(points), 0.8), surface=True)
+    assert (joined.max() == 0) == joins
+
+
+def test_a_surface_without_opacity_has_no_pieces():
+    gaussians, labels, opacities = table(gap=0.3)
+    assert len(with_pieces(gaussians, labels, 0 * opacities, surface=True)) == len(labels)

@@ -60,15 +60,14 @@ export class Kinds {
   }
 
   /**
-   * Scores with all of each object with a noun of which some splats are taken, and without the little that they take
-   * of other things (completed in lexsplat.scenes.words).
+   * Scores with all of each of some objects of which much is taken, and without the little that is taken of other
+   * things (completed in lexsplat.scenes.words).
    */
-  completed(scores: Float32Array, taken: number[], nouns: string[], isSurface: (name: string) => boolean): Float32Array {
+  completed(scores: Float32Array, taken: number[], named: number[], isSurface: (name: string) => boolean): Float32Array {
     this.#places ??= this.#found();
     const isTaken = new Set(taken);
-    const named = new Set(this.named(nouns));
-    const isMuch = (splats: number[]): boolean => splats.filter((i) => isTaken.has(i)).length >= PIECE * splats.length;
-    const found = [...named].filter((place) => isMuch(this.#places![place].splats));
+    const isMuch = (splats: number[]): boolean => splats.length > 0 && splats.filter((i) => isTaken.has(i)).length >= PIECE * splats.length;
+    const found = named.filter((place) => isMuch(this.#places![place].splats));
     if (found.length === 0) return scores;
     const result = scores.slice();
     const border = this.geometry.rule.threshold - 1e-4;
@@ -76,7 +75,7 @@ export class Kinds {
       for (const i of this.#places[place].splats) if (!isTaken.has(i)) result[i] = Math.max(result[i], MEMBER);
     }
     this.#places.forEach(({ splats }, place) => {
-      if (named.has(place) || isSurface(this.#objects[place].name) || isMuch(splats)) return;
+      if (named.includes(place) || isSurface(this.#objects[place].name) || isMuch(splats)) return;
       for (const i of splats) if (isTaken.has(i)) result[i] = Math.min(result[i], border);
     });
     return result;

@@ -97,7 +97,9 @@ export class Tables implements Source {
     const order: Presence[] = ["no", "unsure", "yes"];
     const places = parts.map(({ presence }) => order.indexOf(presence));
     const presence = order[together ? Math.min(...places) : Math.max(...places)];
-    const shown = presence === "no" ? parts : parts.filter((part) => part.presence !== "no");
+    const bare = ({ phrase: words }: Answer): string => words.toLowerCase().split(" ").filter((word) => !this.dictionary.grammar.has("colors", word)).join(" ");
+    const isOneNoun = !together && presence === "yes" && new Set(parts.map(bare)).size === 1; // red or green apple
+    const shown = presence === "no" ? parts : parts.filter((part) => part.presence === "yes" || (part.presence === "unsure" && !isOneNoun));
     const scores = shown[0].scores.slice();
     for (const part of shown.slice(1)) part.scores.forEach((score, i) => (scores[i] = Math.max(scores[i], score)));
     const lacking = parts.filter((part) => part.presence === "no").map((part) => `${part.unknown ? "not found" : "not in this scene"}: “${part.phrase}”`);
@@ -236,9 +238,13 @@ export class Tables implements Source {
     const opacity = splats.reduce((sum, i) => sum + this.geometry.opacities[i], 0);
     if (splats.length && opacity < this.geometry.rule.evidence_faint * splats.length) return { scores: own, own, presence: "no" as const, threshold };
     const sure = this.#hasColor(phrase, splats, held) && parts?.presence !== "unsure";
-    if (presence === "yes" && sure && !this.#isQualified(phrase) && !isPart(phrase, words) && !isPartAlone(phrase, words)) {
+    if (presence === "yes" && sure && !isPart(phrase, words) && !isPartAlone(phrase, words)) {
       const noun = phrase.toLowerCase().split(" of ")[0].split(" ").at(-1)!;
-      if (!grammar.has("stuff", noun)) scores = this.kinds.completed(scores, splats, singulars(noun), (name) => grammar.has("surfaces", name));
+      const named = this.kinds.named(singulars(noun)).filter((place) => {
+        const { name } = this.kinds.entry(place);
+        return !grammar.has("stuff", name) && (name === phrase.toLowerCase() || !this.#isQualified(phrase));
+      });
+      scores = this.kinds.completed(scores, splats, named, (name) => grammar.has("surfaces", name));
     }
     return { scores, own, ...parts, presence: presence === "yes" && !sure ? ("unsure" as const) : presence, threshold };
   }

@@ -15,7 +15,8 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.rotations import covariances
 
 _SMALLEST, _LARGEST = 0.05, 0.2
-"""Opacity of a piece, relative to the largest cluster. What is smaller is a speck, what is larger may be a thing."""
+"""Opacity of a piece, relative to the largest cluster. What is smaller is a speck, but in the plane of a surface; what
+is larger may be a thing."""
 _REACH = 1.5
 """Gaussians reach each other where they are at most this many of their standard deviations apart, that way."""
 _NEAREST = 4
@@ -48,7 +49,10 @@ def with_pieces(
     if len(totals) < 2:
         return labels
     things = shares >= _LARGEST
-    pieces = ~things & (_level(gaussians, labels, int(totals.argmax())) if surface else shares >= _SMALLEST)
+    things[totals.argmax()] = True
+    pieces = ~things & (shares >= _SMALLEST)
+    if surface:
+        pieces = ~things & (pieces | _level(gaussians, labels, int(totals.argmax())))
     joined = np.arange(len(shares))
     for _ in range(_ROUNDS if surface else 1):
         members = np.flatnonzero(pieces[labels])
@@ -72,8 +76,12 @@ def _level(gaussians: Gaussians, labels: IntArray, largest: int) -> NDArray[np.b
     own = means[labels == largest]
     normal = np.linalg.eigh(np.cov(own.T))[1][:, 0] if len(own) > 1 else np.zeros(3)
     low, high = np.quantile(own @ normal, [_TAIL, 1 - _TAIL])
+    members = np.flatnonzero(labels == largest)
+    thick = max(
+        high - low, float(np.median(_deviations(gaussians, members, np.tile(normal, (len(members), 1)))))
+    )
     heights = np.bincount(labels, means @ normal) / np.bincount(labels)
-    return np.asarray(np.abs(heights - (low + high) / 2) <= 1.5 * (high - low))
+    return np.asarray(np.abs(heights - (low + high) / 2) <= 1.5 * thick)
 
 
 def _apart(gaussians: Gaussians, members: IntArray, others: IntArray) -> tuple[IntArray, FloatArray]:
@@ -92,7 +100,7 @@ def _apart(gaussians: Gaussians, members: IntArray, others: IntArray) -> tuple[I
 
 
 def _deviations(gaussians: Gaussians, index: IntArray, way: FloatArray) -> FloatArray:
-    """Standard deviations ``[S, 4]`` of Gaussians along unit directions ``[S, 4, 3]``."""
+    """Standard deviations ``[...]`` of Gaussians ``[...]`` along unit directions ``[..., 3]``."""
     chosen = torch.from_numpy(index.ravel()).to(gaussians.device)
     quats, scales = (each.detach()[chosen].cpu().double() for each in (gaussians.quats, gaussians.scales))
     shapes = covariances(quats, scales).numpy().reshape(*index.shape, 3, 3)

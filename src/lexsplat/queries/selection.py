@@ -28,7 +28,7 @@ from lexsplat.queries.clusters import LINK, clusters, spacing
 from lexsplat.queries.pieces import with_pieces
 from lexsplat.queries.places import given_length, place_of
 from lexsplat.queries.touching import divided
-from lexsplat.queries.vocabulary import DIVIDED
+from lexsplat.queries.vocabulary import is_divided
 from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.lazy import at_first_call
 
@@ -436,8 +436,7 @@ class Selection:
         firm = opacities >= FAINT
         counted = None if self.seen is None else self.seen.counted(self.indices)
         labels = divided(points, firm, clusters(points, firm, counted), self.up.direction)
-        surface = not DIVIDED.isdisjoint(self.phrase.lower().split()[-1:])
-        labels = with_pieces(self.selected, labels, opacities, surface=surface)
+        labels = with_pieces(self.selected, labels, opacities, surface=is_divided(self.phrase))
         return labels, np.bincount(labels, weights=opacities).astype(np.float64)
 
 

@@ -76,6 +76,12 @@ QUALITIES = frozenset(words(_QUALITIES)) | COLORS | STATES
 """Adjectives that may follow their noun: "is the mug red", "vase, white"."""
 
 
+def is_divided(phrase: str) -> bool:
+    """Whether a phrase names one of `DIVIDED`, and not a union or a relation of such."""
+    last = phrase.lower().split()
+    return bool(last) and last[-1] in DIVIDED and {"and", "or", "not", "minus"}.isdisjoint(last)
+
+
 def has_color(phrase: str) -> bool:
     """Whether a phrase names a color."""
     return not COLORS.isdisjoint(phrase.lower().replace("grey", "gray").split())

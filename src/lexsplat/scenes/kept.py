@@ -25,7 +25,7 @@ from lexsplat.queries.part_names import NAMES as PART_NAMES
 from lexsplat.queries.presence import DescribedPlaces
 from lexsplat.queries.seen import MOST_VIEWS, Seen
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.vocabulary import STUFF, default_vocabulary
+from lexsplat.queries.vocabulary import DIVIDED, STUFF, SURFACES, default_vocabulary
 from lexsplat.runtime.errors import FileFormatError, LexsplatError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import digest
@@ -199,6 +199,8 @@ def _object_parts(scene: Scene) -> Iterator[bytes]:
         everyday_words(),
         default_vocabulary(scene.clip),
         sorted(STUFF),
+        sorted(SURFACES),
+        sorted(DIVIDED),
         encoder.get("encoder_hash", encoder["encoder"]),
     )
     yield repr((words, scene.query, scene.world.up.direction.tolist())).encode()

@@ -15,7 +15,7 @@ from lexsplat.queries.objects import name_probabilities, pieces_of_others, whole
 from lexsplat.queries.presence import FAINT
 from lexsplat.queries.relations import same
 from lexsplat.queries.relevancy import check_prompts
-from lexsplat.queries.selection import Selection
+from lexsplat.queries.selection import SMALLEST_SHARE, Selection
 from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary, gives_way
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import atomic_path
@@ -121,9 +121,7 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     for number in [*known[~surfaces].tolist(), *known[surfaces].tolist()]:
         mask, name = named == number, words[number]
         both = scene.selection(mask | (pieces == number), scores, phrase=name)
-        for each in [both] if name in STUFF else both.instances:
-            if not bool(mask[each.indices].any()):
-                continue
+        for each in [both] if name in STUFF else _instances(both, mask):
             named[each.indices] = number
             each = each.within(shown)
             if (
@@ -133,6 +131,18 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
                     _named(each, words, classifier.strengths(texts, _mean_codes(scene, each)[None])[0])
                 )
     return tuple(sorted(found, key=lambda each: -float(segments.masses[each.indices].sum())))
+
+
+def _instances(both: Selection, mask: torch.Tensor) -> list[Selection]:
+    """The instances of a mask ``[N]`` with the pieces that they reach, from those of it and of all pieces."""
+    if len(both) == int(mask.sum()):
+        return both.instances
+    labels, weights = both._clusters()
+    own = np.bincount(labels[mask[both.indices].cpu().numpy()], minlength=len(weights)) > 0
+    kept = np.flatnonzero(own & (weights >= SMALLEST_SHARE * weights[own].max(initial=0.0)))
+    order = kept[np.argsort(-weights[kept], kind="stable")]
+    members = torch.from_numpy(labels).to(both.indices.device)
+    return [both.part(both.indices[members == int(label)]) for label in order]
 
 
 def _mean_codes(scene: Scene, thing: Selection) -> torch.Tensor:

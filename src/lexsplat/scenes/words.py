@@ -1,7 +1,8 @@
 """What one prompt selects, where the objects of the scene know more than its relevancy.
 
 A kind such as "toy" is its members (`lexsplat.queries.kinds`), a part is cut within its thing
-(`lexsplat.queries.parts`), and a thing in a color has that color in its pixels (`lexsplat.queries.colors`).
+(`lexsplat.queries.parts`), a thing in a color has that color in its pixels (`lexsplat.queries.colors`), and a name is
+all of the object that is listed under it.
 """
 
 from __future__ import annotations
@@ -129,9 +130,11 @@ def completed(scene: Scene, prompt: str, word: Word) -> Word:
     """
     if word.presence != "yes" or word.members or form_used(scene.field, scene.query) != "segment":
         return word
-    if scene.query.fixed or is_qualified(prompt) or is_part(prompt) or is_part_alone(prompt):
+    if scene.query.fixed or is_part(prompt) or is_part_alone(prompt):
         return word
     taken, named = (word.scores >= BORDER) & ~scene.hidden, listed_under(scene, noun_of(prompt))
+    if is_qualified(prompt):  # a yellow book is not the stack
+        named = [each for each in named if each.phrase == prompt.lower()]
     found = [
         each
         for each in named
