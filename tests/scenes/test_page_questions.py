@@ -17,7 +17,8 @@ PIXEL_SCALE = HALF
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
 
 SINGLE = (
-    "red things", "something red", "what is red?", "red or green apple", "red toys", "all fruits", "every fruit", "blue or red mug",
+    "red things", "something red", "what is red?", "red toys", "all fruits", "every fruit", "blue or red mug",
+    "red or green apple",
     "apple and banana", "what can I eat?", "what do I drink from?", "things made of wood", "everything",
     "yellow things", "wooden things", "anything soft", "is there a mug and a duck?", "blue mugs", "any animals?",
     "objects", "a place to sit", "cone you see at road works", "is the mug red?", "hey robot, where is the duck?",

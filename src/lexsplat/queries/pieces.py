@@ -15,8 +15,8 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.rotations import covariances
 
 _SMALLEST, _LARGEST = 0.05, 0.2
-"""Opacity of a piece, relative to the largest cluster. What is smaller is a speck, but in the plane of a surface; what
-is larger may be a thing."""
+"""Opacity of a piece, relative to the largest cluster. What is smaller is a speck, but in the plane of a surface;
+what is larger may be a thing."""
 _REACH = 1.5
 """Gaussians reach each other where they are at most this many of their standard deviations apart, that way."""
 _NEAREST = 4
