@@ -178,6 +178,8 @@ def test_a_click_names_the_thing(plain_page, ball_page):
 def test_two_clicks_measure_the_distance_between_the_surfaces_there(plain_page, ball_page):
     page, scene = plain_page, ball_page.scene
     page.evaluate("lexsplat.app.clear()")
+    page.locator(".search input").fill("")
+    page.locator("canvas").focus()
     page.evaluate("lexsplat.app.jump(lexsplat.app.manifest.views.find((v) => v.name === 'view0'))")
     page.evaluate("lexsplat.app.stage.settled()")
     lens = page.evaluate("lexsplat.app.stage.lens()")
