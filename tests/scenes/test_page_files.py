@@ -27,6 +27,7 @@ from lexsplat.scenes.publishing.sidecar import segment_rule
 PIXEL_SCALE = HALF
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
 
+SIZE = {"width": 480, "height": 360}
 HOSTILE = "<img src=x onerror='window.pwned=1'></script><script>window.pwned=1</script>\"'{{TITLE}}"
 
 
@@ -241,7 +242,7 @@ def test_the_picture_comes_before_the_words_and_what_is_typed_meanwhile_is_answe
         const held = (name) => name === "words.bin" ? new Promise((go) => (window.go = go)) : Promise.resolve();
         window.fetch = (name, ...rest) => held(name).then(() => own(name, ...rest));
     """
-    page = browser.new_page(viewport={"width": 480, "height": 360}, reduced_motion="reduce")
+    page = browser.new_page(viewport=SIZE, device_scale_factor=HALF, reduced_motion="reduce")
     page.set_default_timeout(60_000)
     page.add_init_script(hold)
     page.requested = []

@@ -256,7 +256,7 @@ def test_a_video_has_many_pictures_also_where_they_take_long(shared_page):
             const own = stage.renderer.render;
             let count = 0;
             stage.renderer.render = function (...given) {
-                const end = performance.now() + 400;
+                const end = performance.now() + 300;
                 while (performance.now() < end);
                 count++;
                 return own.apply(this, given);
