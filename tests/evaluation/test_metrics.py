@@ -3,12 +3,10 @@ import sys
 
 import numpy as np
 import pytest
-import sklearn.metrics
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from skimage.metrics import peak_signal_noise_ratio
 
 from lexsplat.evaluation import metrics
 
@@ -30,6 +28,8 @@ def test_psnr_of_a_constant_difference_of_a_tenth_is_20_db():
 
 
 def test_psnr_agrees_with_scikit_image():
+    from skimage.metrics import peak_signal_noise_ratio
+
     expected = peak_signal_noise_ratio(
         random_image(0).astype(float), random_image(1).astype(float), data_range=1
     )
@@ -82,6 +82,8 @@ def test_without_torchvision_lpips_is_refused_before_torchmetrics_loads(monkeypa
 
 @given(SCORES, MASKS, st.integers(0, 1000))
 def test_mask_scores_agree_with_scikit_learn_at_every_threshold(scores, ground_truth, step):
+    import sklearn.metrics
+
     counts = metrics.threshold_counts(scores, ground_truth)
     found, predicted = counts.at(step / 1000), scores >= step / 1000
     flat = ground_truth.ravel(), predicted.ravel()
@@ -116,6 +118,8 @@ def test_ground_truth_must_be_boolean_and_of_the_shape_of_the_scores():
 
 @given(SCORES, MASKS.filter(np.any))
 def test_average_precision_agrees_with_scikit_learn_interpolated_at_101_recalls(scores, ground_truth):
+    import sklearn.metrics
+
     precisions, recalls, _ = sklearn.metrics.precision_recall_curve(ground_truth.ravel(), scores.ravel())
     precisions, recalls = precisions[:-1], recalls[:-1]  # without the point (1, 0) that no threshold makes
     expected = [precisions[recalls >= k / 100].max() for k in range(101)]

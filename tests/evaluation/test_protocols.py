@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-import sklearn.metrics
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -106,6 +105,8 @@ def test_official_scores_are_bounded(scores, mask):
 
 @given(SCORES, MASKS.filter(np.any))
 def test_official_masks_agree_with_scikit_learn_where_nothing_is_resized(scores, mask):
+    import sklearn.metrics
+
     found = protocols.official_scores(scores, mask)
     predicted = (scores >= 0.5).ravel()
     ground_truth = mask.ravel()
@@ -209,6 +210,8 @@ def test_lerf_2d_refuses_a_map_of_another_size():
 
 @given(SCORES, MASKS)
 def test_silhouettes_agree_with_scikit_learn(alpha, ground_truth):
+    import sklearn.metrics
+
     expected = sklearn.metrics.jaccard_score(ground_truth.ravel(), (alpha > 0.7).ravel(), zero_division=0)
     assert protocols.silhouette_iou(alpha, ground_truth) == pytest.approx(expected)
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sklearn.neighbors import NearestNeighbors
 
 from lexsplat.geometry.gaussians import SH_C0, Gaussians, gaussians_from_points
 
@@ -16,6 +15,8 @@ def some_points(count: int = 50, seed: int = 0) -> tuple[np.ndarray, np.ndarray]
 
 
 def test_initial_scales_are_the_mean_distance_to_three_neighbors():
+    from sklearn.neighbors import NearestNeighbors
+
     points, colors = some_points()
     distances, _ = NearestNeighbors(n_neighbors=4).fit(points).kneighbors(points)
     gaussians = gaussians_from_points(points, colors)

@@ -215,11 +215,11 @@ def row_of_rooms(count: int) -> np.ndarray:
 
 @pytest.mark.slow
 def test_every_closed_room_of_a_row_has_views(monkeypatch):
-    monkeypatch.setattr(candidates, "_MOST_PLACES", 16)
-    points = row_of_rooms(4)
+    monkeypatch.setattr(candidates, "_MOST_PLACES", 12)
+    points = row_of_rooms(3)
     chosen = choose_views(solid(points), up=UP)
     positions = np.stack([camera.position for camera in chosen.cameras])
-    assert np.unique(positions[:, 0] // 5).tolist() == list(range(4))
+    assert np.unique(positions[:, 0] // 5).tolist() == list(range(3))
     assert chosen.visible > 0.75 * len(points)  # ceilings are above all views
     assert chosen.unseen < 0.1 * chosen.visible
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,14 +27,17 @@ from lexsplat.scenes.publishing.sidecar import segment_rule
 PIXEL_SCALE = HALF
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
 
+SIZE = {"width": 480, "height": 360}
 HOSTILE = "<img src=x onerror='window.pwned=1'></script><script>window.pwned=1</script>\"'{{TITLE}}"
+
+
+WORDS = dict.fromkeys([*(f"ball {n}" for n in range(5)), "toy", "chair", "bed"], "n")
 
 
 @pytest.fixture
 def ball_page(tmp_path, monkeypatch):
     """Publishes the scene of balls with some options; returns the folder and the ground truth."""
-    words = [*(f"ball {n}" for n in range(5)), "toy", "chair", "bed"]
-    monkeypatch.setattr(vocabulary, "everyday_phrases", lambda bundled: dict.fromkeys(words, "n"))
+    monkeypatch.setattr(vocabulary, "everyday_phrases", lambda bundled: WORDS)
     scene, ground_truth = ball_scene()
 
     def write(target=tmp_path / "page", **options):
@@ -42,14 +48,37 @@ def ball_page(tmp_path, monkeypatch):
     return write
 
 
-def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_reported_without_a_text_tower(tab, ball_page):
-    with serving(ball_page()) as address:
-        page = show(tab, address)
-        assert page.evaluate("lexsplat.app.source.dictionary.similar('bal 3')[0]") == "ball 3"
-        page.fill(".search input", "a green unicorn")
-        page.keyboard.press("Enter")
-        until(page, "document.querySelector('.status')?.textContent.includes('is not among')")
-        assert page.locator(".card").count() == 0
+@pytest.fixture(scope="module")
+def plain_folder(tmp_path_factory) -> Path:
+    """The folder that `ball_page` publishes without options; read-only."""
+    target = tmp_path_factory.mktemp("plain") / "page"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(vocabulary, "everyday_phrases", lambda bundled: WORDS)
+        publish(ball_scene()[0], target, PublishOptions(words_only=True))
+    return target
+
+
+@pytest.fixture(scope="module")
+def plain_address(plain_folder) -> Iterator[str]:
+    with serving(plain_folder) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def plain_page(browser, plain_address) -> Iterator[Any]:
+    """That page where a photo was taken, for tests that need no other."""
+    opened = open_page(browser, plain_address + "#view=view0", 720, 480, scale=HALF)
+    yield opened
+    opened.close()
+
+
+def test_a_typing_error_finds_the_word_and_an_unknown_phrase_is_reported_without_a_text_tower(plain_page):
+    page = plain_page
+    assert page.evaluate("lexsplat.app.source.dictionary.similar('bal 3')[0]") == "ball 3"
+    page.fill(".search input", "a green unicorn")
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('.status')?.textContent.includes('is not among')")
+    assert page.locator(".card").count() == 0
 
 
 @pytest.mark.parametrize("ending", ["ply", "spz", "sog"])
@@ -130,49 +159,49 @@ def test_a_large_text_tower_is_loaded_only_after_its_size_was_reported(tab, ball
         assert [url for url in page.requested if url.endswith(path.name)]
 
 
-def test_a_click_names_the_thing(tab, ball_page):
-    with serving(ball_page()) as address:
-        page = show(tab, address + "#view=view0")
-        centers = list(CENTERS)
-        pixels = page.evaluate(
-            """(points) => points.map((point) => {
-                const at = lexsplat.app.stage.camera.position.clone().fromArray(point);
-                const hit = lexsplat.app.stage.pixel(at);
-                return [hit.x, hit.y];
-            })""",
-            [center.tolist() for center in centers],
-        )
-        camera = ball_page.scene.camera("view0")
-        nearest = int(np.argmin([np.linalg.norm(center - camera.position) for center in centers]))
-        page.evaluate("(at) => lexsplat.app.whatIs(at[0], at[1]).then(() => null)", pixels[nearest])
-        assert page.locator(".status .examples button").first.inner_text() == f"ball {nearest}"
+def test_a_click_names_the_thing(plain_page, ball_page):
+    page = plain_page
+    centers = list(CENTERS)
+    pixels = page.evaluate(
+        """(points) => points.map((point) => {
+            const at = lexsplat.app.stage.camera.position.clone().fromArray(point);
+            const hit = lexsplat.app.stage.pixel(at);
+            return [hit.x, hit.y];
+        })""",
+        [center.tolist() for center in centers],
+    )
+    camera = ball_page.scene.camera("view0")
+    nearest = int(np.argmin([np.linalg.norm(center - camera.position) for center in centers]))
+    page.evaluate("(at) => lexsplat.app.whatIs(at[0], at[1]).then(() => null)", pixels[nearest])
+    assert page.locator(".status .examples button").first.inner_text() == f"ball {nearest}"
 
 
-def test_two_clicks_measure_the_distance_between_the_surfaces_there(tab, ball_page):
-    scene = ball_page.scene
-    with serving(ball_page()) as address:
-        page = show(tab, address + "#view=view0", 720, 480)
-        lens = page.evaluate("lexsplat.app.stage.lens()")
-        width, height, focal, x, y = lens["lens"]
-        K = np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
-        camera = Camera(width, height, K, np.array(lens["viewmat"]).reshape(4, 4))
-        places = (camera.viewmat[:3, :3] @ CENTERS.T).T + camera.viewmat[:3, 3]
-        pixels = (places @ K.T)[:, :2] / places[:, 2:]
-        free = [at for at in pixels if 60 < at[0] < width - 100 and 70 < at[1] < height - 60][:2]
-        first, second = (surface_at(scene.gaussians, camera, *at).point for at in free)
-        page.keyboard.press("m")
-        for at in free:
-            page.mouse.click(*at)
-        until(page, "document.querySelector('.distance').textContent !== ''")
-        told = page.locator(".distance").inner_text()
-        assert told.endswith(" units")
-        until(
-            page, "document.querySelector('.status').textContent.endsWith('units (the scale is not known)')"
-        )
-        marks = [one.bounding_box() for one in page.locator(".mark").all()]
-        label = page.locator(".distance").bounding_box()
-        assert label["y"] + label["height"] <= min(mark["y"] for mark in marks), "the text hides no point"
-        assert float(told.split()[0]) == pytest.approx(np.linalg.norm(first - second), rel=0.03)
+def test_two_clicks_measure_the_distance_between_the_surfaces_there(plain_page, ball_page):
+    page, scene = plain_page, ball_page.scene
+    page.evaluate("lexsplat.app.clear()")
+    page.locator(".search input").fill("")
+    page.locator("canvas").focus()
+    page.evaluate("lexsplat.app.jump(lexsplat.app.manifest.views.find((v) => v.name === 'view0'))")
+    page.evaluate("lexsplat.app.stage.settled()")
+    lens = page.evaluate("lexsplat.app.stage.lens()")
+    width, height, focal, x, y = lens["lens"]
+    K = np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
+    camera = Camera(width, height, K, np.array(lens["viewmat"]).reshape(4, 4))
+    places = (camera.viewmat[:3, :3] @ CENTERS.T).T + camera.viewmat[:3, 3]
+    pixels = (places @ K.T)[:, :2] / places[:, 2:]
+    free = [at for at in pixels if 60 < at[0] < width - 100 and 70 < at[1] < height - 60][:2]
+    first, second = (surface_at(scene.gaussians, camera, *at).point for at in free)
+    page.keyboard.press("m")
+    for at in free:
+        page.mouse.click(*at)
+    until(page, "document.querySelector('.distance').textContent !== ''")
+    told = page.locator(".distance").inner_text()
+    assert told.endswith(" units")
+    until(page, "document.querySelector('.status').textContent.endsWith('units (the scale is not known)')")
+    marks = [one.bounding_box() for one in page.locator(".mark").all()]
+    label = page.locator(".distance").bounding_box()
+    assert label["y"] + label["height"] <= min(mark["y"] for mark in marks), "the text hides no point"
+    assert float(told.split()[0]) == pytest.approx(np.linalg.norm(first - second), rel=0.03)
 
 
 def test_names_titles_and_prompts_of_others_run_no_script(tab, ball_page, tmp_path, monkeypatch):
@@ -185,7 +214,7 @@ def test_names_titles_and_prompts_of_others_run_no_script(tab, ball_page, tmp_pa
         target = tmp_path / ("hostile.html" if single else "hostile")
         ball_page(target, title=HOSTILE, description=HOSTILE, start_view=HOSTILE, single_file=single)
     with serving(tmp_path / "hostile") as address:
-        for place in (address, f"{address}#q={HOSTILE}&view={HOSTILE}", (tmp_path / "hostile.html").as_uri()):
+        for place in (f"{address}#q={HOSTILE}&view={HOSTILE}", (tmp_path / "hostile.html").as_uri()):
             page = show(tab, place)
             page.keyboard.press("v")
             page.fill(".search input", "<img")
@@ -207,32 +236,31 @@ def test_a_single_file_opens_by_double_click_and_a_folder_says_what_to_do(tab, b
     assert "python -m http.server" in page.locator(".failure").inner_text()
 
 
-def test_the_picture_comes_before_the_words_and_what_is_typed_meanwhile_is_answered(browser, ball_page):
+def test_the_picture_comes_before_the_words_and_what_is_typed_meanwhile_is_answered(browser, plain_address):
     hold = """
         const own = window.fetch;
         const held = (name) => name === "words.bin" ? new Promise((go) => (window.go = go)) : Promise.resolve();
         window.fetch = (name, ...rest) => held(name).then(() => own(name, ...rest));
     """
-    with serving(ball_page()) as address:
-        page = browser.new_page(viewport={"width": 480, "height": 360}, reduced_motion="reduce")
-        page.set_default_timeout(60_000)
-        page.add_init_script(hold)
-        page.requested = []
-        page.on("request", lambda request: page.requested.append(request.url.rpartition("/")[2]))
-        page.goto(address)
-        until(page, "Boolean(window.go)")
-        assert {"codes.bin", "words.txt", "words.bin"}.isdisjoint(
-            page.requested[: page.requested.index("scene.ply") + 1]
-        )
-        assert page.evaluate("document.querySelector('.progress')") is None
-        page.fill(".search input", "ball 3")
-        page.keyboard.press("Enter")
-        until(page, "document.querySelector('.status').textContent.includes('loading')")
-        assert page.locator(".card").count() == 0
-        page.evaluate("window.go()")
-        until(page, "Boolean(document.querySelector('.card'))")
-        assert "here, one place" in page.locator(".card").inner_text()
-        page.close()
+    page = browser.new_page(viewport=SIZE, device_scale_factor=HALF, reduced_motion="reduce")
+    page.set_default_timeout(60_000)
+    page.add_init_script(hold)
+    page.requested = []
+    page.on("request", lambda request: page.requested.append(request.url.rpartition("/")[2]))
+    page.goto(plain_address)
+    until(page, "Boolean(window.go)")
+    assert {"codes.bin", "words.txt", "words.bin"}.isdisjoint(
+        page.requested[: page.requested.index("scene.ply") + 1]
+    )
+    assert page.evaluate("document.querySelector('.progress')") is None
+    page.fill(".search input", "ball 3")
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('.status').textContent.includes('loading')")
+    assert page.locator(".card").count() == 0
+    page.evaluate("window.go()")
+    until(page, "Boolean(document.querySelector('.card'))")
+    assert "here, one place" in page.locator(".card").inner_text()
+    page.close()
 
 
 def test_of_too_many_gaussians_those_that_cover_most_from_the_camera_are_drawn_and_it_is_reported(
@@ -291,30 +319,28 @@ COUNTING = """
 """
 
 
-def test_software_draws_coarsely_at_first_and_a_prompt_computes_and_sorts_no_splat(browser, ball_page):
-    with serving(ball_page()) as address:
-        page = open_page(browser, address + "#view=view0", 720, 480, COUNTING)
-        page.evaluate("lexsplat.app.stage.settled()")
-        drawn = [call for call in page.evaluate("calls") if call[0] == "drawElementsInstanced"]
-        assert drawn[0][1] == 360, "half the resolution"
-        assert drawn[-1][1] == 720
-        assert all(instances == 12 for _, _, instances in drawn), "1,500 splats, 128 to an instance"
-        assert "readPixels" in {name for name, *_ in page.evaluate("calls")}, "the splats were sorted"
-        before = picture(page)
-        page.evaluate("window.calls.length = 0")
-        page.evaluate("lexsplat.app.ask('ball 3', false, false)")
-        after = picture(page)
-        assert np.abs(after - before)[:, 330:].max() > 60
-        assert {name for name, *_ in page.evaluate("calls")} == {"drawElementsInstanced"}
-        page.close()
+def test_software_draws_coarsely_at_first_and_a_prompt_computes_and_sorts_no_splat(browser, plain_address):
+    page = open_page(browser, plain_address + "#view=view0", 720, 480, COUNTING)
+    page.evaluate("lexsplat.app.stage.settled()")
+    drawn = [call for call in page.evaluate("calls") if call[0] == "drawElementsInstanced"]
+    assert drawn[0][1] == 360, "half the resolution"
+    assert drawn[-1][1] == 720
+    assert all(instances == 12 for _, _, instances in drawn), "1,500 splats, 128 to an instance"
+    assert "readPixels" in {name for name, *_ in page.evaluate("calls")}, "the splats were sorted"
+    before = picture(page)
+    page.evaluate("window.calls.length = 0")
+    page.evaluate("lexsplat.app.ask('ball 3', false, false)")
+    after = picture(page)
+    assert np.abs(after - before)[:, 330:].max() > 60
+    assert {name for name, *_ in page.evaluate("calls")} == {"drawElementsInstanced"}
+    page.close()
 
 
 def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(
-    browser, tab, ball_page, tmp_path
+    browser, tab, plain_folder, plain_address, tmp_path
 ):
-    folder = ball_page()
     damaged = tmp_path / "damaged"
-    shutil.copytree(folder, damaged)
+    shutil.copytree(plain_folder, damaged)
     content = bytearray((damaged / "codes.bin").read_bytes())
     content[100] ^= 1
     (damaged / "codes.bin").write_bytes(content)
@@ -326,12 +352,10 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(
     with serving(damaged) as address:
         page = show(tab, address)
         assert page.locator(".failure").inner_text().startswith("page.wasm: expected WebAssembly")
-    with serving(folder) as address:
-        page = open_page(
-            browser, address, script="HTMLCanvasElement.prototype.getContext = () => null", scale=HALF
-        )
-        assert "needs WebGL 2" in page.locator(".failure").inner_text()
-        page.close()
+    nothing = "HTMLCanvasElement.prototype.getContext = () => null"
+    page = open_page(browser, plain_address, script=nothing, scale=HALF)
+    assert "needs WebGL 2" in page.locator(".failure").inner_text()
+    page.close()
 
 
 @pytest.mark.parametrize(
@@ -359,8 +383,8 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(
         (lambda m: m.clear(), "version 7 of a lexsplat page"),
     ],
 )
-def test_a_manifest_that_lacks_a_field_is_refused_by_its_name(tab, ball_page, change, told):
-    folder = ball_page()
+def test_a_manifest_that_lacks_a_field_is_refused_by_its_name(tab, plain_folder, tmp_path, change, told):
+    folder = shutil.copytree(plain_folder, tmp_path / "page")
     manifest = json.loads((folder / "manifest.json").read_text())
     change(manifest)
     (folder / "manifest.json").write_text(json.dumps(manifest))

@@ -256,7 +256,7 @@ def test_a_video_has_many_pictures_also_where_they_take_long(shared_page):
             const own = stage.renderer.render;
             let count = 0;
             stage.renderer.render = function (...given) {
-                const end = performance.now() + 400;
+                const end = performance.now() + 300;
                 while (performance.now() < end);
                 count++;
                 return own.apply(this, given);
@@ -291,7 +291,8 @@ def test_what_the_server_did_not_understand_is_not_denied_and_long_texts_stay_in
     assert page.locator(".search input").input_value() == 'ball "1'
     page.evaluate("lexsplat.app.clear()")
     page.locator(".search input").fill("")
-    page.locator(".search input").press_sequentially("ball " * 30)
+    page.locator(".search input").focus()
+    page.keyboard.insert_text("ball " * 60)  # obeys the length of the box, as keys do
     page.keyboard.press("Enter")
     until(page, "Boolean(document.querySelector('.card'))")
     assert len(page.evaluate("lexsplat.app.answers[0].prompt")) <= MAX_LENGTH

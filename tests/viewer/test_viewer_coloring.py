@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from sklearn.decomposition import PCA
 from support.language_scene import LanguageScene, make_codebook, make_scene
 
 from lexsplat.language.fields import CodeField
@@ -32,6 +31,8 @@ def field(balls) -> CodeField:
 
 
 def test_language_colors_are_the_principal_components_of_the_features(balls, field):
+    from sklearn.decomposition import PCA
+
     features = (field.code_probabilities() @ balls.codebook.clip).double().numpy()[:-1]
     expected = PCA(3).fit_transform(features)
     colors = language_colors(field)[:-1].astype(float)
@@ -73,6 +74,8 @@ def test_an_unknown_mode_is_refused(balls, field):
 
 
 def test_a_trained_field_has_language_and_code_colors(balls):
+    from sklearn.decomposition import PCA
+
     from lexsplat.language.fields import TrainedField
 
     field = TrainedField.initial(
