@@ -62,24 +62,22 @@ def with_pieces(
         order = np.argsort(apart, kind="stable")
         found, first = np.unique(labels[members[order]], return_index=True)
         reached = apart[order[first]] <= _REACH
-        joined[found[reached]] = joined[labels[near[order[first[reached]]]]]
-        things, pieces = things.copy(), pieces.copy()
-        things[found[reached]], pieces[found[reached]] = True, False
         if not reached.any():
             break
+        joined[found[reached]] = joined[labels[near[order[first[reached]]]]]
+        things[found[reached]], pieces[found[reached]] = True, False
     return np.unique(joined[labels], return_inverse=True)[1].astype(np.intp)
 
 
 def _level(gaussians: Gaussians, labels: IntArray, largest: int) -> NDArray[np.bool_]:
-    """Which clusters lie in the plane of the largest one, at most as far from it as that one is thick."""
+    """Which clusters lie in the plane of the largest one, on average at most one thickness above or below it."""
     means = gaussians.means.detach().cpu().double().numpy()
-    own = means[labels == largest]
+    members = np.flatnonzero(labels == largest)
+    own = means[members]
     normal = np.linalg.eigh(np.cov(own.T))[1][:, 0] if len(own) > 1 else np.zeros(3)
     low, high = np.quantile(own @ normal, [_TAIL, 1 - _TAIL])
-    members = np.flatnonzero(labels == largest)
-    thick = max(
-        high - low, float(np.median(_deviations(gaussians, members, np.tile(normal, (len(members), 1)))))
-    )
+    spreads = _deviations(gaussians, members, np.broadcast_to(normal, own.shape))
+    thick = max(high - low, float(np.median(spreads)))
     heights = np.bincount(labels, means @ normal) / np.bincount(labels)
     return np.asarray(np.abs(heights - (low + high) / 2) <= 1.5 * thick)
 

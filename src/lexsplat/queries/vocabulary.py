@@ -78,8 +78,8 @@ QUALITIES = frozenset(words(_QUALITIES)) | COLORS | STATES
 
 def is_divided(phrase: str) -> bool:
     """Whether a phrase names one of `DIVIDED`, and not a union or a relation of such."""
-    last = phrase.lower().split()
-    return bool(last) and last[-1] in DIVIDED and {"and", "or", "not", "minus"}.isdisjoint(last)
+    *before, noun = phrase.lower().split() or [""]
+    return noun in DIVIDED and {"and", "or", "not", "minus"}.isdisjoint(before)
 
 
 def has_color(phrase: str) -> bool:
