@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,23 @@ from lexsplat.runtime.errors import ModelError
 CAPTURE = Path(__file__).resolve().parents[1] / "demo" / "captures" / "tabletop"
 """A bundled capture with masks of what its photos show."""
 
-WORDS = (
-    "red apple", "blue mug", "gold ring", "brown teddy bear", "green bottle", "rubber duck", "stack of books",
-    "traffic cone", "potted plant", "table lamp", "banana", "pumpkin",
-)  # fmt: skip
+PLACES = {
+    "red apple": ("view_015", (92, 162, 185, 251)),
+    "blue mug": ("view_057", (190, 154, 262, 232)),
+    "gold ring": ("view_015", (338, 244, 421, 294)),
+    "brown teddy bear": ("view_051", (87, 66, 193, 213)),
+    "green bottle": ("view_057", (2, 51, 54, 163)),
+    "rubber duck": ("view_051", (268, 198, 384, 268)),
+    "stack of books": ("view_015", (358, 141, 480, 226)),
+    "traffic cone": ("view_003", (26, 179, 119, 285)),
+    "potted plant": ("view_057", (178, 25, 314, 143)),
+    "table lamp": ("view_033", (394, 36, 475, 136)),
+    "banana": ("view_015", (47, 225, 176, 290)),
+    "pumpkin": ("view_057", (278, 135, 358, 202)),
+}
+"""For a word, the first bundled photo where its mask is widest, and the box around it (left, top, right, bottom)."""
+
+WORDS = tuple(PLACES)
 """Content of the images."""
 
 ENOUGH = 0.75
@@ -28,20 +42,18 @@ ENOUGH = 0.75
 _MARGIN = 1.2  # side of an image, in sides of the box around what it shows
 
 
-def bundled_images(side: int) -> Tensor:
-    """Square images of `WORDS`, where each is largest in the bundled photos: ``[W, 3, side, side]`` in 0..1."""
-    return torch.cat([_bundled_image(word, side) for word in WORDS])
+def bundled_images(side: int, words: Sequence[str] = WORDS) -> Tensor:
+    """Square images of words, where each is widest in the bundled photos: ``[W, 3, side, side]`` in 0..1."""
+    photos = {name: _photo(name) for name in {PLACES[word][0] for word in words}}
+    return torch.cat([_cut(photos[name], box, side) for name, box in map(PLACES.__getitem__, words)])
 
 
-def _bundled_image(word: str, side: int) -> Tensor:
-    best, box = Path(), (0, 0, 0, 0)
-    for path in sorted(CAPTURE.glob(f"segmentations/*/{word.replace(' ', '_')}.png")):
-        with Image.open(path) as mask:
-            found = mask.convert("L").getbbox() or (0, 0, 0, 0)
-        if found[2] - found[0] > box[2] - box[0]:
-            best, box = path, found
-    with Image.open(CAPTURE / "images" / f"{best.parent.name}.jpg") as photo:
-        image = torch.from_numpy(np.asarray(photo.convert("RGB"), dtype=np.float32) / 255).permute(2, 0, 1)
+def _photo(name: str) -> Tensor:
+    with Image.open(CAPTURE / "images" / f"{name}.jpg") as photo:
+        return torch.from_numpy(np.asarray(photo.convert("RGB"), dtype=np.float32) / 255).permute(2, 0, 1)
+
+
+def _cut(image: Tensor, box: tuple[int, int, int, int], side: int) -> Tensor:
     half = _MARGIN * max(box[2] - box[0], box[3] - box[1]) / 2
     x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
     top, left = max(0, round(y - half)), max(0, round(x - half))
@@ -92,7 +104,7 @@ def check_dense(dino: DenseEncoder) -> None:
     Raises:
         ModelError: If it does not.
     """
-    features = dino.encode_dense(bundled_images(96)[0], short_side=96)
+    features = dino.encode_dense(bundled_images(96, WORDS[:1])[0], short_side=96)
     _check_unlike(features.flatten(0, 1)[:: max(1, features.shape[1] + 1)], dino.name)
 
 

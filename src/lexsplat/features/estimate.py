@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lexsplat.features.checks import bundled_images
+from lexsplat.features.checks import WORDS, bundled_images
 from lexsplat.features.encoders import DenseEncoder, ImageTextEncoder
 from lexsplat.features.extraction import cpu_batch, crop_levels, encoded_size, parallel_views
 from lexsplat.features.pretrained import resize_images
@@ -68,7 +68,7 @@ def estimate(
 def _crop_seconds(clip: ImageTextEncoder, config: FeatureConfig, capture_size: tuple[int, int]) -> float:
     """Seconds of one crop by one worker."""
     boxes, (width, height) = _boxes(config, capture_size), encoded_size(capture_size, config)
-    image = resize_images(bundled_images(_IMAGE)[:1], height, width)[0].to(clip.device)
+    image = resize_images(bundled_images(_IMAGE, WORDS[:1]), height, width)[0].to(clip.device)
     batch, count = cpu_batch(clip.image_size), 1
     encode = clip.encode_images if config.tokens == "class" else lambda crops: clip.encode_patches(crops)[0]
 
@@ -98,7 +98,7 @@ def count_crops(config: FeatureConfig, capture_size: tuple[int, int]) -> int:
 
 def _dense_seconds(dino: DenseEncoder, config: FeatureConfig, capture_size: tuple[int, int]) -> float:
     """Seconds of DINO for a photo: one pass on its own patch grid, times the number of shifted copies."""
-    image = bundled_images(config.dino_short_side)[0]
+    image = bundled_images(config.dino_short_side, WORDS[:1])[0]
     start = time.perf_counter()
     grid = dino.encode_dense(image, short_side=config.dino_short_side, max_tokens=config.dino_max_tokens)
     seconds = time.perf_counter() - start
