@@ -1,4 +1,4 @@
-"""Hashes of large models are kept: a question need not read a gigabyte to know its encoder."""
+"""Hashes of models are kept: a question need not read a gigabyte to know its encoder."""
 
 from __future__ import annotations
 
@@ -32,14 +32,35 @@ def kept() -> list:
     return list(folder.iterdir()) if folder.exists() else []
 
 
-def test_a_kept_hash_is_the_hash_and_the_weights_are_not_read_again(model, clip_folder, monkeypatch):
+@pytest.fixture
+def forget(monkeypatch):
+    """Forgets the hashes that the process knows, as a new process does not know them."""
+    return lambda: monkeypatch.setattr(hub, "_hashes", {})
+
+
+def test_a_kept_hash_is_the_hash_and_the_weights_are_not_read_again(model, clip_folder, monkeypatch, forget):
     first = hub.content_hash(model, "clip")
+    forget()
     monkeypatch.setattr(hub, "KEPT_FROM", 1 << 60)
     assert first == hub.content_hash(clip_folder, "clip")
     monkeypatch.setattr(hub, "KEPT_FROM", 1)
     assert len(kept()) == 1
     monkeypatch.setattr(hub, "blocks", lambda path: pytest.fail("the files are read again"))
     assert hub.content_hash(model, "clip") == first
+
+
+def test_a_process_reads_a_small_model_once_and_again_when_it_is_changed(model, monkeypatch):
+    monkeypatch.setattr(hub, "KEPT_FROM", 1 << 26)
+    reads, read = [], hub.blocks
+    monkeypatch.setattr(hub, "blocks", lambda path: reads.append(path) or read(path))
+    first = hub.content_hash(model, "clip")
+    once = len(reads)
+    assert (hub.content_hash(model, "clip"), len(reads)) == (first, once)
+    with (model / "config.json").open("a") as file:
+        file.write(" ")
+    assert hub.content_hash(model, "clip") != first
+    assert len(reads) == 2 * once
+    assert not kept()
 
 
 @pytest.mark.skipif(
@@ -84,15 +105,17 @@ def test_hashes_of_fresh_files_and_of_small_models_are_not_kept(model, monkeypat
 
 
 @pytest.mark.parametrize("damage", [b"", b"\xff\xfe", b"0" * 31, b"../" * 10])
-def test_a_damaged_kept_hash_is_computed_again(model, damage):
+def test_a_damaged_kept_hash_is_computed_again(model, damage, forget):
     first = hub.content_hash(model, "clip")
+    forget()
     (path,) = kept()
     path.write_bytes(damage)
     assert hub.content_hash(model, "clip") == first
     assert path.read_text() == first
 
 
-def test_a_cache_that_cannot_be_written_does_no_harm(model, tmp_path):
+def test_a_cache_that_cannot_be_written_does_no_harm(model, tmp_path, forget):
     (tmp_path / "cache").write_text("a file where the folder should be")
     first = hub.content_hash(model, "clip")
+    forget()
     assert hub.content_hash(model, "clip") == first

@@ -173,32 +173,47 @@ def preprocessing_file(folder: Path) -> Path | None:
 def content_hash(folder: Path, tower: str) -> str:
     """Hash of the files on which a model's output depends (`loaded_files`). 32 hex digits.
 
-    Hashes of large models are kept in the user's cache, under the place, size and time of change of their files.
+    The process keeps the hash under the place, size and time of change of the files. The user's cache keeps that of
+    large models so.
     """
     files = loaded_files(folder, tower)
-    kept = _path_of_hash(files)
+    state = _state(files)
+    if state in _hashes:
+        return _hashes[state]
+    kept = _path_of_hash(state)
     with contextlib.suppress(OSError, UnicodeDecodeError):
         if kept is not None and re.fullmatch("[0-9a-f]{32}", known := kept.read_text()):
             return known
     found = digest((part for path in files for part in chain([path.name.encode()], blocks(path))), 16)
-    if kept is not None and kept == _path_of_hash(files):  # no file has changed meanwhile
+    if state and state == _state(files):  # no file has changed meanwhile
+        _hashes[state] = found
         with contextlib.suppress(OSError):
-            write_file(kept, found)
+            if kept is not None:
+                write_file(kept, found)
     return found
 
 
-def _path_of_hash(files: Iterable[Path]) -> Path | None:
-    """Where the hash of these files is kept; None for small models, fresh files, and users without a home."""
+_State = tuple[tuple[str, str, int, int, int], ...]
+_hashes: dict[_State, str] = {}
+
+
+def _state(files: Iterable[Path]) -> _State:
+    """Names, places, sizes and times of files, which differ once a file is changed; () for fresh files."""
     facts = [(path, path.stat()) for path in files]
-    newest = max(stat.st_mtime for _, stat in facts)
-    if sum(stat.st_size for _, stat in facts) < KEPT_FROM or time.time() - newest < _FRESH:
-        return None
-    rows = [
+    if time.time() - max(stat.st_mtime for _, stat in facts) < _FRESH:
+        return ()
+    return tuple(
         (path.name, str(path.resolve()), stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
         for path, stat in facts
-    ]
+    )
+
+
+def _path_of_hash(state: _State) -> Path | None:
+    """Where the hash of files is kept; None for small models, fresh files, and users without a home."""
+    if sum(size for _, _, size, _, _ in state) < KEPT_FROM:
+        return None
     with contextlib.suppress(RuntimeError):
-        return user_cache() / "hashes" / digest([repr(rows).encode()], 16)
+        return user_cache() / "hashes" / digest([repr(list(state)).encode()], 16)
     return None
 
 
