@@ -22,7 +22,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.picking import surface_at
 from lexsplat.scenes.publishing import PublishOptions, publish, splat_file, vocabulary
 from lexsplat.scenes.publishing.manifest import checksums
-from lexsplat.scenes.publishing.sidecar import segment_rule
+from lexsplat.scenes.publishing.rules import part_rule, segment_rule
 
 PIXEL_SCALE = HALF
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path")]
@@ -377,10 +377,21 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(
             ),
             "24 numbers in language.part_rule",
         ),
+        (
+            lambda m: (
+                m["language"].update(
+                    segments="s",
+                    segment_rule=dict.fromkeys(segment_rule(), 1),
+                    part_rule=dict.fromkeys(part_rule(), 1),
+                ),
+                m["words"]["rule"].update(parts=[1]),
+            ),
+            "lists of names, qualities, colors, parts in words.rule",
+        ),
         (lambda m: m["selection_rule"].pop("link"), "11 numbers in selection_rule"),
         (lambda m: m.pop("grammar"), "an object in grammar"),
         (lambda m: m["files"].pop("scene.ply"), "scene.ply in files"),
-        (lambda m: m.clear(), "version 7 of a lexsplat page"),
+        (lambda m: m.clear(), "version 8 of a lexsplat page"),
     ],
 )
 def test_a_manifest_that_lacks_a_field_is_refused_by_its_name(tab, plain_folder, tmp_path, change, told):

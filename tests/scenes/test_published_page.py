@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import base64
+import json
+import os
+import shutil
 from collections.abc import Iterator
 from typing import Any
 
@@ -142,6 +145,25 @@ def test_answers_are_those_of_python(page, demo):
             assert answer["marked"] == pytest.approx(len(selection), rel=2 * near), answer["prompt"]
     assert [answer["from"] for answer in found[:3]] == ["dictionary", "dictionary", "text tower"]
     assert [answer["presence"] for answer in found[-2:]] == ["no", "no"]
+
+
+def test_a_page_without_a_text_tower_answers_its_phrases_as_one_with_a_tower(page, tab, light_demo, tmp_path):
+    """Names are whole objects, and parts are cut within their things."""
+    folder = shutil.copytree(light_demo, tmp_path / "page", copy_function=os.link)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").unlink()
+    (folder / "manifest.json").write_text(json.dumps(manifest | {"text": None}))
+    asked = """async (prompts) => {
+        const { source } = await lexsplat.ready;
+        const answers = [];
+        for (const prompt of prompts) answers.push(await source.answer(prompt, "#fff"));
+        return answers.map(({ from, presence, scores }) => [from, presence, (BASE64)(scores)]);
+    }""".replace("BASE64", BASE64)
+    prompts = ["stack of books", "mug handle", "red apple"]
+    with serving(folder) as place:
+        found = show(tab, place).evaluate(asked, prompts)
+    assert found == page.evaluate(asked, prompts)
+    assert [answer[0] for answer in found] == ["dictionary"] * 3
 
 
 def test_free_phrases_have_the_scores_and_segments_of_python(page, demo):

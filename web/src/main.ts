@@ -96,7 +96,7 @@ async function tables(files: Files, manifest: Manifest, stage: Stage, geometry: 
   const kinds = new Kinds(members, geometry, manifest.objects ?? [], manifest.kinds ?? {});
   const dictionary = new Dictionary(new TextDecoder().decode(phrases), table, language.num_codes, new Grammar(manifest.grammar));
   const spelling = english && letters ? new Spelling(letters, english.things) : null;
-  const parts = language.part_rule && manifest.text ? { ...language.part_rule, words: manifest.text.everyday } : null;
+  const parts = language.part_rule && manifest.words.rule ? { ...language.part_rule, words: manifest.words.rule } : null;
   return new Tables(stage, geometry, codesOf, whole, parts, dictionary, loader, kinds, spelling, english?.only ?? false);
 }
 

@@ -202,6 +202,8 @@ export interface Manifest {
     count: number;
     /** The filter of English words, what typing errors may mean, and whether the encoder knows nothing else. */
     english?: { file: string; things: string[]; only: boolean } | null;
+    /** Missing where a server answers. */
+    rule?: EverydayRule;
   };
   objects: ObjectEntry[] | null;
   /** Places in the list of objects for each kind of things ("toy") that the scene holds; "" is any thing. */
@@ -217,7 +219,6 @@ export interface Manifest {
     /** Token that fills texts up, where all tokens see each other; null where they see those before them. */
     padding: number | null;
     templates: string[];
-    everyday: EverydayRule;
   } | null;
   views: ViewEntry[];
   files: Record<string, FileEntry>;
@@ -225,12 +226,13 @@ export interface Manifest {
   provenance: Record<string, unknown>;
 }
 
-const FORMAT_VERSION = 7;
+const FORMAT_VERSION = 8;
 
 const isText = (value: unknown): boolean => typeof value === "string";
 const isRecord = (value: unknown): boolean => typeof value === "object" && value !== null && !Array.isArray(value);
 const areNumbers = (count: number) => (value: unknown): boolean =>
   Array.isArray(value) && value.length === count && value.every(Number.isFinite);
+const areTexts = (value: unknown): boolean => Array.isArray(value) && value.every(isText);
 const orNull = (check: (value: unknown) => boolean) => (value: unknown): boolean => value === null || check(value);
 
 /** What the page cannot do without: where it is in the manifest, what it is, and how that is seen. */
@@ -266,6 +268,7 @@ const PART_RULE = [
   "held", "fewest", "neighbors", "color", "score", "rounds", "shared", "best", "lowest", "mostly", "all", "usual", "spread", "first",
   "last", "steps", "near", "few", "walked", "nearest", "short", "shorter", "firm", "outside",
 ];
+const WORD_LISTS = ["names", "qualities", "colors", "parts"];
 const SELECTION_RULE = [
   "threshold", "link", "smallest_share", "convincing", "peak_count", "faint", "same_surface", "least_surface",
   "evidence_share", "evidence_count", "evidence_faint",
@@ -292,6 +295,7 @@ function lacking(manifest: Manifest): string {
   if (manifest.language?.segments) {
     if (!isRule(manifest.language.segment_rule, SEGMENT_RULE)) return `${SEGMENT_RULE.length} numbers in language.segment_rule`;
     if (!isRule(manifest.language.part_rule, PART_RULE)) return `${PART_RULE.length} numbers in language.part_rule`;
+    if (!WORD_LISTS.every((name) => areTexts(at(`words.rule.${name}`)))) return `lists of ${WORD_LISTS.join(", ")} in words.rule`;
   }
   if (!isRule(manifest.selection_rule, SELECTION_RULE)) return `${SELECTION_RULE.length} numbers in selection_rule`;
   return manifest.files[manifest.scene.file] ? "" : `${manifest.scene.file} in files`;

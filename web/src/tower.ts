@@ -73,6 +73,7 @@ export class TextTower {
   readonly #tensors: Map<string, Matrix>;
   readonly #tokenizer: PhraseTokenizer;
   readonly #text: NonNullable<Manifest["text"]>;
+  readonly #rule: EverydayRule;
   readonly #heads: number;
   readonly #activation: (x: number) => number;
   readonly #layers: number;
@@ -81,6 +82,7 @@ export class TextTower {
     this.#tensors = readSafetensors(weights);
     const positions = this.#get("embeddings.position_embedding.weight").rows;
     this.#text = manifest.text!;
+    this.#rule = manifest.words.rule!;
     const file = JSON.parse(new TextDecoder().decode(tokenizer)) as object;
     this.#tokenizer = new PhraseTokenizer(file, positions, this.#text.padding);
     this.#heads = this.#text.heads;
@@ -92,22 +94,21 @@ export class TextTower {
 
   /** Heights and relevancy of a phrase for every code. */
   describe(phrase: string): Description {
-    const { everyday } = this.#text;
+    const rule = this.#rule;
     const heights = this.#heights(phrase);
     const best = this.#get("best").data as Float32Array;
     const tables = ["places", "best_colored", "part_fits"];
     const [places, colored, fits] = tables.map((name) => (this.#tensors.get(name)?.data as Float32Array) ?? null);
-    const compared = colored && hasColor(phrase, everyday) && !isPart(phrase, everyday) ? colored : best;
-    const thing = thingOfPart(phrase, everyday);
-    const rivals = thing ? besideThing(heights, this.#heights(thing), compared, everyday) : compared;
-    return { table: relevancyOf(heights, rivals, everyday), heights, best, compared, rule: everyday, places, colored, fits };
+    const compared = colored && hasColor(phrase, rule) && !isPart(phrase, rule) ? colored : best;
+    const thing = thingOfPart(phrase, rule);
+    const rivals = thing ? besideThing(heights, this.#heights(thing), compared, rule) : compared;
+    return { table: relevancyOf(heights, rivals, rule), heights, best, compared, rule, places, colored, fits };
   }
 
   #heights(phrase: string): Heights {
-    const { templates, everyday } = this.#text;
-    const embedding = unit(templates.map((template) => this.embed(template.replace("{}", phrase))));
+    const embedding = unit(this.#text.templates.map((template) => this.embed(template.replace("{}", phrase))));
     const [codewords, mean] = ["codewords", "mean"].map((name) => this.#get(name).data as Float32Array);
-    return heightsOf(codewords, embedding, mean, everyday);
+    return heightsOf(codewords, embedding, mean, this.#rule);
   }
 
   /** The embedding of a phrase, of unit length. */

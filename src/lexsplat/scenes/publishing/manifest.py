@@ -16,10 +16,10 @@ from lexsplat.queries.selection import Selection
 from lexsplat.queries.vocabulary import SURFACES
 from lexsplat.scenes.pixels import object_colors, seen_colors
 from lexsplat.scenes.publishing.grammar import page_grammar
-from lexsplat.scenes.publishing.sidecar import selection_rule
+from lexsplat.scenes.publishing.rules import selection_rule
 from lexsplat.scenes.scene import Scene
 
-FORMAT, FORMAT_VERSION = "lexsplat-page", 7
+FORMAT, FORMAT_VERSION = "lexsplat-page", 8
 DRAWN_SPLATS = 1_000_000
 """Maximum number of Gaussians that a page draws at once; it chooses those that cover most of the image."""
 MOST_OBJECTS = 200

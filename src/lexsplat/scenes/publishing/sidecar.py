@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import ModuleType
 
 import numpy as np
 import torch
 
 from lexsplat.language.segments import Segments
-from lexsplat.queries import clusters, parts, picking, presence, selection, thresholds
-from lexsplat.queries import segments as rule
 from lexsplat.queries.selection import Selection
 from lexsplat.scenes.formats.language import StoredLanguage
 
@@ -30,43 +27,6 @@ def splat_codes(language: StoredLanguage) -> bytes:
     shares = torch.cat([weights.sum(1, keepdim=True), weights[:, 1:]], dim=1) / largest
     quantized = (shares * 255).round().clamp(0, 255).to(torch.uint8)
     return language.codes.numpy().tobytes() + quantized.numpy().tobytes()
-
-
-def segment_rule() -> dict[str, float]:
-    """The constants by which the page takes or leaves segments: those of `lexsplat.queries.segments`."""
-    cut = constants_of(rule, "LOWEST", "BORDER", "BETTER", "ENOUGH")
-    named = constants_of(rule, "OWN_SHARE", "STEEPNESS", "MOST_CERTAIN", "BELOW")
-    return {**cut, **named, "threshold": rule.SEGMENT_THRESHOLD}
-
-
-def part_rule() -> dict[str, float]:
-    """The constants by which the page cuts parts of things: those of `lexsplat.queries.parts`."""
-    return {
-        **constants_of(parts, "HELD", "FEWEST", "NEIGHBORS", "COLOR", "SCORE", "ROUNDS", "SHARED", "BEST"),
-        **constants_of(parts, "LOWEST", "MOSTLY", "ALL", "USUAL", "SPREAD"),
-        "first": float(parts.PLACES[0]),
-        "last": float(parts.PLACES[-1]),
-        "steps": len(parts.PLACES),
-        **constants_of(parts, "NEAR", "FEW", "WALKED", "NEAREST", "SHORT", "SHORTER", "FIRM", "OUTSIDE"),
-    }
-
-
-def selection_rule() -> dict[str, float]:
-    """The constants by which the page finds surfaces, instances and evidence: those of `lexsplat.queries`."""
-    return {
-        "threshold": thresholds.BORDER,
-        "link": clusters.LINK,
-        **constants_of(selection, "SMALLEST_SHARE", "CONVINCING", "PEAK_COUNT", "FAINT"),
-        **constants_of(picking, "SAME_SURFACE", "LEAST_SURFACE"),
-        "evidence_share": presence.PEAK_SHARE,
-        "evidence_count": presence.PEAK_COUNT,
-        "evidence_faint": presence.FAINT,
-    }
-
-
-def constants_of(module: ModuleType, *names: str) -> dict[str, float]:
-    """Constants of a module by their names in small letters, as the page reads them."""
-    return {name.lower(): getattr(module, name) for name in names}
 
 
 def segments_file(segments: Segments, uncertainties: torch.Tensor, hidden: torch.Tensor) -> bytes:

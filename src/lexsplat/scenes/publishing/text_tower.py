@@ -11,11 +11,7 @@ from torch import Tensor
 
 from lexsplat.features.portable import TextWeights
 from lexsplat.features.text import load_text
-from lexsplat.queries import everyday, part_names, presence
-from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES
 from lexsplat.runtime.files import save_tensors
-from lexsplat.scenes.gone import gone_nouns
-from lexsplat.scenes.publishing.sidecar import constants_of
 from lexsplat.scenes.scene import Scene
 
 PRECISE_BYTES = 8_000_000
@@ -58,20 +54,6 @@ def write_text_tower(scene: Scene, weights: Path, tokenizer: Path) -> dict[str, 
         "tokenizer": tokenizer.name,
         **{name: getattr(tower, name) for name in ("heads", "activation", "epsilon", "padding")},
         "templates": list(scene.query.templates),
-        "everyday": {
-            **constants_of(everyday, "BORDER", "STEEPNESS", "OFFSET", "PEAK_SHARE"),
-            "peak": scene.everyday_scale.peak,
-            **constants_of(presence, "YES", "NO", "YES_SEGMENT", "YES_COLORED", "YES_PART", "NO_SEGMENT"),
-            **constants_of(presence, "NO_PART", "AT_THING", "BORDER_PART", "OVER_THING"),
-            "names": sorted(NAMES),
-            "qualities": sorted(QUALITIES),
-            "colors": sorted(COLORS | {"grey"}),
-            "parts": list(part_names.NAMES),
-            "rival": part_names.RIVAL,
-            "alike": part_names.ALIKE,
-            "doubtful": part_names.DOUBTFUL,
-            "gone": sorted(gone_nouns(scene)),
-        },
     }
 
 

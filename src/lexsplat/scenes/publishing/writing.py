@@ -29,13 +29,8 @@ from lexsplat.scenes.publishing.manifest import (
     one_line,
     scene_manifest,
 )
-from lexsplat.scenes.publishing.sidecar import (
-    objects_file,
-    part_rule,
-    segment_rule,
-    segments_file,
-    splat_codes,
-)
+from lexsplat.scenes.publishing.rules import everyday_rule, part_rule, segment_rule
+from lexsplat.scenes.publishing.sidecar import objects_file, segments_file, splat_codes
 from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.text_tower import write_text_tower
 from lexsplat.scenes.publishing.vocabulary import offered_phrases, phrase_answers, words_file
@@ -243,6 +238,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
             "phrases": "words.txt",
             "table": "words.bin",
             "count": len(phrases),
+            "rule": everyday_rule(scene),
             "english": {
                 "file": "english.bin",
                 "things": words_of_things(scene.clip),
