@@ -83,3 +83,28 @@ def test_a_leg_of_a_table_joins_it_as_it_joins_other_things_and_a_speck_below_do
 def test_a_surface_without_opacity_has_no_pieces():
     gaussians, labels, opacities = table(gap=0.3)
     assert len(with_pieces(gaussians, labels, 0 * opacities, surface=True)) == len(labels)
+
+
+def box_with_a_large_gaussian(height: float):
+    """Small round Gaussians on five faces of a cube of side 1, and a flat one over its open top: 2 clusters."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (1000, 3))
+    faces = rng.integers(0, 5, 1000)
+    points[np.arange(1000), faces % 3] = np.where(faces < 3, -0.5, 0.5)  # the faces but that at z = .5
+    points = np.concatenate([points, [[0, 0, height]]])
+    gaussians = gaussians_from_points(points, np.full((len(points), 3), 0.5), sh_degree=0, opacity=0.8)
+    gaussians.log_scales.fill_(np.log(0.03))
+    gaussians.log_scales[-1] = torch.tensor([0.4, 0.4, 0.05]).log()
+    return gaussians, np.repeat([0, 1], [1000, 1]), np.full(len(points), 0.8)
+
+
+@pytest.mark.parametrize(("height", "joins"), [(0.49, True), (0.55, False)], ids=["in the face", "above it"])
+def test_specks_fill_a_face_of_a_thing_that_they_reach_but_do_not_extend_it(height, joins):
+    joined = with_pieces(*box_with_a_large_gaussian(height))
+    assert joined.tolist() == [0] * 1000 + [0 if joins else 1]
+
+
+def test_nothing_lies_within_a_flat_thing():
+    gaussians, labels, opacities = box_with_a_large_gaussian(0.49)
+    gaussians.means[:, 2] = 0.0
+    assert with_pieces(gaussians, labels, opacities).tolist() == labels.tolist()

@@ -1,22 +1,25 @@
 """Small clusters that are pieces of a larger one, such as the stand of a lamp below its shade.
 
-Few long Gaussians show a thin piece, so that their centers are farther apart than those of the thing. A piece belongs
-to the thing if its Gaussians reach those of the thing. Dimension letters: M Gaussians, S small clusters' Gaussians.
+Few long Gaussians show a thin piece or a plain face, so that their centers are farther apart than those of the rest.
+A piece belongs to the thing if its Gaussians reach those of the thing. Dimension letters: M Gaussians, C small
+clusters, S their Gaussians.
 """
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.rotations import covariances
 
 _SMALLEST, _LARGEST = 0.05, 0.2
-"""Opacity of a piece, relative to the largest cluster. What is smaller is a speck, but in the plane of a surface;
-what is larger may be a thing."""
+"""Opacity of a piece, relative to the largest cluster. What is smaller is a speck, but in the plane of a surface and
+within a thing; what is larger may be a thing."""
 _REACH = 1.5
 """Gaussians reach each other where they are at most this many of their standard deviations apart, that way."""
 _NEAREST = 4
@@ -50,9 +53,8 @@ def with_pieces(
         return labels
     things = shares >= _LARGEST
     things[totals.argmax()] = True
-    pieces = ~things & (shares >= _SMALLEST)
-    if surface:
-        pieces = ~things & (pieces | _level(gaussians, labels, int(totals.argmax())))
+    large = shares >= _SMALLEST
+    pieces = ~things & (large | _level(gaussians, labels, int(totals.argmax()))) if surface else ~things
     joined = np.arange(len(shares))
     for _ in range(_ROUNDS if surface else 1):
         members = np.flatnonzero(pieces[labels])
@@ -61,10 +63,13 @@ def with_pieces(
         near, apart = _apart(gaussians, members, np.flatnonzero(things[labels]))
         order = np.argsort(apart, kind="stable")
         found, first = np.unique(labels[members[order]], return_index=True)
-        reached = apart[order[first]] <= _REACH
+        others, reached = labels[near[order[first]]], apart[order[first]] <= _REACH
+        if not surface:
+            specks = reached & ~large[found]
+            reached[specks] = _within(gaussians, labels, found[specks], others[specks])
         if not reached.any():
             break
-        joined[found[reached]] = joined[labels[near[order[first[reached]]]]]
+        joined[found[reached]] = joined[others[reached]]
         things[found[reached]], pieces[found[reached]] = True, False
     return np.unique(joined[labels], return_inverse=True)[1].astype(np.intp)
 
@@ -80,6 +85,21 @@ def _level(gaussians: Gaussians, labels: IntArray, largest: int) -> NDArray[np.b
     thick = max(high - low, float(np.median(spreads)))
     heights = np.bincount(labels, means @ normal) / np.bincount(labels)
     return np.asarray(np.abs(heights - (low + high) / 2) <= 1.5 * thick)
+
+
+def _within(gaussians: Gaussians, labels: IntArray, specks: IntArray, others: IntArray) -> NDArray[np.bool_]:
+    """Whether each of some clusters ``[C]`` lies, on average, in the convex hull of another one ``[C]``.
+
+    So specks fill a face of a thing, but do not extend it.
+    """
+    means, found = gaussians.means.detach().cpu().double().numpy(), np.zeros(len(specks), bool)
+    for other in np.unique(others):
+        own = np.flatnonzero(others == other)
+        middles = np.stack([means[labels == speck].mean(0) for speck in specks[own]])
+        with contextlib.suppress(QhullError):  # nothing lies within few or flat points
+            sides = ConvexHull(means[labels == other]).equations
+            found[own] = (middles @ sides[:, :3].T + sides[:, 3] <= 0).all(1)
+    return found
 
 
 def _apart(gaussians: Gaussians, members: IntArray, others: IntArray) -> tuple[IntArray, FloatArray]:

@@ -1,15 +1,13 @@
-"""Everything in a scene: objects with names, colors, places and sizes, as selections, data and thumbnails."""
+"""Everything in a scene: objects with names, colors, places and sizes, as selections and data."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw
 
 from lexsplat.queries.objects import name_probabilities, pieces_of_others, whole_segments
 from lexsplat.queries.presence import FAINT
@@ -18,10 +16,10 @@ from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import SMALLEST_SHARE, Selection
 from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary, gives_way
 from lexsplat.runtime.errors import FileFormatError
-from lexsplat.runtime.files import atomic_path
 from lexsplat.scenes.answers import rests_on
 from lexsplat.scenes.facts import NO_SEGMENTS
 from lexsplat.scenes.pixels import object_colors, shown_weights
+from lexsplat.scenes.sheet import write_sheet
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -34,11 +32,6 @@ _NAMES = 3
 _LEAST_PROBABILITY = 0.01
 _FAR_BETTER = 0.5
 """Share of the likeliest name's probability below which an object's own name gives way to it."""
-_TILE = (200, 150)
-_LINE = 16
-_COLUMNS = 5
-_MARGIN = 0.35
-"""Space around an object in its thumbnail, as a share of its size."""
 
 
 def read_vocabulary(path: Path) -> list[str]:
@@ -225,38 +218,3 @@ def _is_part(instance: Selection, other: Selection) -> bool:
     """Whether most of it belongs to another name. A part of a thing is no object; a coin on a table is one."""
     shared = int(other.mask[instance.indices].sum())
     return other.phrase not in SURFACES and shared > 0.5 * len(instance)
-
-
-def write_sheet(scene: Scene, things: Sequence[Selection], path: Path) -> None:
-    """Write a PNG with a thumbnail of each object in the view that shows it best, and its name below."""
-    width, height = _TILE[0], _TILE[1] + _LINE
-    columns = max(1, min(_COLUMNS, len(things)))
-    sheet = Image.new(
-        "RGB", (columns * width, max(1, math.ceil(len(things) / columns)) * height), (30, 30, 34)
-    )
-    draw = ImageDraw.Draw(sheet)
-    for number, thing in enumerate(things):
-        left, top = number % columns * width, number // columns * height
-        tile = _thumbnail(scene, thing)
-        sheet.paste(tile, (left + (width - tile.width) // 2, top + (_TILE[1] - tile.height) // 2))
-        label = f"{number + 1}. {thing.phrase}".encode("latin-1", "replace").decode("latin-1")[:32]
-        draw.text((left + 4, top + _TILE[1] + 2), label, fill="white")  # the built-in font has latin-1 alone
-    with atomic_path(path) as temporary:
-        sheet.save(temporary, format="PNG")
-
-
-def _thumbnail(scene: Scene, thing: Selection) -> Image.Image:
-    """The part of its best view around an object."""
-    camera = scene.cameras.get(thing.best_view)
-    if camera is None:
-        return Image.new("RGB", _TILE)
-    image = scene.render(camera).image.clamp(0, 1).cpu().numpy()
-    pixels, _, _ = camera.project(thing.box.corners)
-    low, high = pixels.min(0), pixels.max(0)
-    reach = _MARGIN * float((high - low).max())
-    limits = np.array([camera.width, camera.height])
-    first = np.clip(low - reach, 0, limits - 2).astype(int)
-    last = np.clip(high + reach, first + 2, limits).astype(int)
-    tile = Image.fromarray((image[first[1] : last[1], first[0] : last[0]] * 255).round().astype(np.uint8))
-    tile.thumbnail(_TILE, Image.Resampling.LANCZOS)
-    return tile
