@@ -70,15 +70,19 @@ def test_a_vocabulary_names_the_things(demo, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_thumbnails_show_the_objects(demo, tmp_path):
+def test_thumbnails_show_the_objects_and_dim_what_is_around(demo, tmp_path):
     document = list_document(demo, (), tmp_path / "new" / "sheet.png")
     with Image.open(document["picture"]) as sheet:
         pixels = np.asarray(sheet)
-    assert pixels.shape[1] == 5 * 200
+    assert pixels.shape[1] == 5 * 240
     number = next(n for n, thing in enumerate(document["objects"]) if thing["name"] == "apple")
-    top, left = number // 5 * 166, number % 5 * 200
-    middle = pixels[top + 50 : top + 100, left + 75 : left + 125].reshape(-1, 3).astype(float).mean(0)
+    top, left = number // 5 * 198, number % 5 * 240
+    tile = pixels[top : top + 180, left : left + 240].astype(float)
+    middle = tile[70:110, 100:140].reshape(-1, 3).mean(0)
     assert middle[0] > 2 * middle[1:].max(), "red"
+    assert tile[:, :10].max() < 0.5 * 255, "what is around has at most .45 of its brightness"
+    lit = (tile.max(2) > 0.5 * 255).mean()
+    assert 0.1 < lit < 0.5, "as large as its tile lets it be"
 
 
 @pytest.mark.slow
