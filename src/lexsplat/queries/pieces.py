@@ -93,12 +93,12 @@ def _within(gaussians: Gaussians, labels: IntArray, specks: IntArray, others: In
     So specks fill a face of a thing, but do not extend it.
     """
     means, found = gaussians.means.detach().cpu().double().numpy(), np.zeros(len(specks), bool)
+    middles = np.stack([np.bincount(labels, axis) for axis in means.T], 1) / np.bincount(labels)[:, None]
     for other in np.unique(others):
         own = np.flatnonzero(others == other)
-        middles = np.stack([means[labels == speck].mean(0) for speck in specks[own]])
         with contextlib.suppress(QhullError):  # nothing lies within few or flat points
             sides = ConvexHull(means[labels == other]).equations
-            found[own] = (middles @ sides[:, :3].T + sides[:, 3] <= 0).all(1)
+            found[own] = (middles[specks[own]] @ sides[:, :3].T + sides[:, 3] <= 0).all(1)
     return found
 
 
@@ -106,7 +106,8 @@ def _apart(gaussians: Gaussians, members: IntArray, others: IntArray) -> tuple[I
     """The one of some Gaussians that each of the members reaches best ``[S]``, and how many deviations away it is."""
     means = gaussians.means.detach().cpu().double().numpy()
     count = min(_NEAREST, len(others))
-    near = others[cKDTree(means[others]).query(means[members], k=range(1, count + 1))[1]]
+    tree = cKDTree(means[others], balanced_tree=False, compact_nodes=False)
+    near = others[tree.query(means[members], k=range(1, count + 1))[1]]
     way = means[near] - means[members][:, None]
     distances = np.linalg.norm(way, axis=2)
     way = way / np.maximum(distances, 1e-12)[..., None]
