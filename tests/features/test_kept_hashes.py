@@ -42,6 +42,20 @@ def test_a_kept_hash_is_the_hash_and_the_weights_are_not_read_again(model, clip_
     assert hub.content_hash(model, "clip") == first
 
 
+def test_a_process_reads_a_model_of_any_size_once_and_again_after_a_change(model, monkeypatch):
+    monkeypatch.setattr(hub, "KEPT_FROM", 1 << 60)
+    read = []
+    monkeypatch.setattr(hub, "blocks", lambda path: read.append(path) or [path.read_bytes()])
+    now = time.time()
+    for seconds in (0, 60, 60):  # at first the copy is so new that a change might leave its time as it is
+        monkeypatch.setattr(hub.time, "time", lambda seconds=seconds: now + seconds)
+        first = hub.content_hash(model, "clip")
+    assert len(read) == 2 * len(set(read))
+    (model / "config.json").write_text((model / "config.json").read_text() + " ")
+    assert hub.content_hash(model, "clip") != first
+    assert len(read) == 3 * len(set(read))
+
+
 @pytest.mark.skipif(
     os.name == "nt", reason="the system keeps no time of the last change beside that of writing"
 )

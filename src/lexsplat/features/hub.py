@@ -173,32 +173,53 @@ def preprocessing_file(folder: Path) -> Path | None:
 def content_hash(folder: Path, tower: str) -> str:
     """Hash of the files on which a model's output depends (`loaded_files`). 32 hex digits.
 
-    Hashes of large models are kept in the user's cache, under the place, size and time of change of their files.
+    Hashes are kept as long as the process lives, those of large models also in the user's cache, under the place, size
+    and time of change of their files.
     """
     files = loaded_files(folder, tower)
-    kept = _path_of_hash(files)
+    facts = _facts_of(files)
+    if facts in _known:
+        return _known[facts]
+    kept = _path_of_hash(files, facts)
     with contextlib.suppress(OSError, UnicodeDecodeError):
         if kept is not None and re.fullmatch("[0-9a-f]{32}", known := kept.read_text()):
             return known
     found = digest((part for path in files for part in chain([path.name.encode()], blocks(path))), 16)
-    if kept is not None and kept == _path_of_hash(files):  # no file has changed meanwhile
-        with contextlib.suppress(OSError):
-            write_file(kept, found)
+    if facts == _facts_of(files):  # no file has changed meanwhile
+        if _settled(files, "st_mtime", "st_ctime"):
+            _known[facts] = found
+        if kept is not None:
+            with contextlib.suppress(OSError):
+                write_file(kept, found)
     return found
 
 
-def _path_of_hash(files: Iterable[Path]) -> Path | None:
+_known: dict[str, str] = {}
+"""Hashes that this process has computed, by what `_facts_of` found."""
+
+
+def _facts_of(files: Iterable[Path]) -> str:
+    """The names, places, sizes and times of files, in one string."""
+    rows = []
+    for path in files:
+        stat = path.stat()
+        rows.append((path.name, str(path.resolve()), stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns))
+    return repr(rows)
+
+
+def _settled(files: Iterable[Path], *times: str) -> bool:
+    """Whether some times of files, such as "st_mtime", are not so new that another change might leave them as they
+    are.
+    """
+    return time.time() - max(getattr(path.stat(), name) for path in files for name in times) >= _FRESH
+
+
+def _path_of_hash(files: Collection[Path], facts: str) -> Path | None:
     """Where the hash of these files is kept; None for small models, fresh files, and users without a home."""
-    facts = [(path, path.stat()) for path in files]
-    newest = max(stat.st_mtime for _, stat in facts)
-    if sum(stat.st_size for _, stat in facts) < KEPT_FROM or time.time() - newest < _FRESH:
+    if sum(path.stat().st_size for path in files) < KEPT_FROM or not _settled(files, "st_mtime"):
         return None
-    rows = [
-        (path.name, str(path.resolve()), stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns)
-        for path, stat in facts
-    ]
     with contextlib.suppress(RuntimeError):
-        return user_cache() / "hashes" / digest([repr(rows).encode()], 16)
+        return user_cache() / "hashes" / digest([facts.encode()], 16)
     return None
 
 
