@@ -173,7 +173,7 @@ def preprocessing_file(folder: Path) -> Path | None:
 def content_hash(folder: Path, tower: str) -> str:
     """Hash of the files on which a model's output depends (`loaded_files`). 32 hex digits.
 
-    Hashes are kept as long as the process lives, those of large models also in the user's cache, under the place, size
+    Hashes are kept for the life of the process, those of large models also in the user's cache, under the place, size
     and time of change of their files.
     """
     files = loaded_files(folder, tower)
