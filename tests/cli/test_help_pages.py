@@ -1,17 +1,24 @@
 """Help pages of the command line: options, placeholders and defaults."""
 
+import os
 import re
 
 import pytest
 
 from lexsplat import cli
 
+PAGES: dict[tuple, str] = {}
+"""Pages by their words and width, each made once: a long one takes a quarter of a second."""
+
 
 def help_page(capsys, *arguments: str) -> str:
-    with pytest.raises(SystemExit) as ended:
-        cli.main([*arguments])
-    assert ended.value.code == 0
-    return capsys.readouterr().out
+    key = (*arguments, os.environ.get("COLUMNS"))
+    if key not in PAGES:
+        with pytest.raises(SystemExit) as ended:
+            cli.main([*arguments])
+        assert ended.value.code == 0
+        PAGES[key] = capsys.readouterr().out
+    return PAGES[key]
 
 
 def options_of(page: str) -> set[str]:

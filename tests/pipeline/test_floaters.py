@@ -25,8 +25,9 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.fixture(autouse=True)
 def _few_looks(monkeypatch) -> None:
-    """Half as many looks from above and around as usual."""
+    """A quarter as many looks from above and around as usual, and half as many for floaters."""
     monkeypatch.setattr(candidates, "_AZIMUTHS", 4)
+    monkeypatch.setattr(floaters, "_VIEWS", 50)
 
 
 def dusty() -> tuple[Gaussians, Gaussians]:

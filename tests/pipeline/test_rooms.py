@@ -285,7 +285,7 @@ def test_a_bathroom_is_chosen_from_inside_by_default(caplog, monkeypatch):
 def test_floaters_that_hide_most_of_a_scene_are_a_warning(caplog, monkeypatch):
     """What hardly any place can see does not count as visible, so the share that no view shows may be small."""
     monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 30)
-    monkeypatch.setattr(candidates, "_MOST_PLACES", 10)
+    monkeypatch.setattr(candidates, "_MOST_PLACES", 6)
     table = solid(on_table())
     generator = np.random.default_rng(2)
     fog = gaussians_from_points(

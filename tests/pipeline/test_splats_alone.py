@@ -36,8 +36,8 @@ def _few_candidates(monkeypatch) -> None:
     """Choices of a test take seconds."""
     monkeypatch.setattr(choosing, "SIZE", (240, 180))
     monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 30)
-    monkeypatch.setattr(candidates, "_MOST_PLACES", 10)
-    monkeypatch.setattr(candidates, "_AZIMUTHS", 8)
+    monkeypatch.setattr(candidates, "_MOST_PLACES", 6)
+    monkeypatch.setattr(candidates, "_AZIMUTHS", 4)
 
 
 def ball(radius: float = 1.0, count: int = 3000) -> np.ndarray:
@@ -85,10 +85,7 @@ def test_a_guessed_up_direction_stays_a_guess_in_the_scene_with_its_warning(tmp_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("thing", ["teddy bear", "red apple"])
-def test_the_up_direction_of_a_thing_alone_is_a_guess_and_contradicts_nobody(
-    tmp_path, thing, caplog, monkeypatch
-):
-    monkeypatch.setattr(candidates, "_AZIMUTHS", 4)
+def test_the_up_direction_of_a_thing_alone_is_a_guess_and_contradicts_nobody(tmp_path, thing, caplog):
     cli.main(["export", "demo", str(tmp_path / "thing.ply"), "--select", thing])
     gaussians = read_splats(tmp_path / "thing.ply")
     with caplog.at_level(logging.WARNING, "lexsplat"):

@@ -36,8 +36,8 @@ def _few_candidates(monkeypatch) -> None:
     """Choices of a test take seconds."""
     monkeypatch.setattr(choosing, "SIZE", (240, 180))
     monkeypatch.setattr(choosing, "_MOST_CANDIDATES", 30)
-    monkeypatch.setattr(candidates, "_MOST_PLACES", 10)
-    monkeypatch.setattr(candidates, "_AZIMUTHS", 8)
+    monkeypatch.setattr(candidates, "_MOST_PLACES", 6)
+    monkeypatch.setattr(candidates, "_AZIMUTHS", 4)
 
 
 def in_room(seed: int = 0) -> np.ndarray:
@@ -148,7 +148,8 @@ def with_floaters(clean: Gaussians, low, high, count: int) -> Gaussians:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.01, 0.05])
-def test_a_furnished_room_with_floaters_is_looked_at_from_inside(share):
+def test_a_furnished_room_with_floaters_is_looked_at_from_inside(share, monkeypatch):
+    monkeypatch.setattr(candidates, "_MOST_PLACES", 10)
     room = solid(furnished(0.35))
     scene = with_floaters(room, [0, 0, 0], [5, 4, 2.5], round(share * len(room)))
     floating = find_floaters(scene, Path("room.ply"))

@@ -18,7 +18,7 @@ CONFIG = BuildConfig(
     clip="color",
     dino="color",
     device="cpu",
-    downscale=2.0,
+    downscale=3.0,
     iterations=20,
     method="trained",
     features=FeatureConfig(crop_sizes=(0.25, 0.4), crop_strides=(0.5, 0.5), map_cells=18),

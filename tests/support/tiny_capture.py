@@ -17,7 +17,8 @@ SPHERES = {  # name: center, radius, color
 QUICK_BUILD = [
     "--clip", "bundled", "--dino", "bundled", "--device", "cpu", "--iterations", "120",
     "--features.crop-sizes", "0.25", "0.5", "--features.crop-strides", "0.5", "0.5",
-    "--codebook.num-codes", "16", "--trained.iterations", "60",
+    "--features.dino-short-side", "64", "--codebook.num-codes", "16", "--codebook.steps", "20",
+    "--trained.iterations", "30",
 ]  # fmt: skip
 """Options of ``lexsplat build`` that make a small scene of the capture in seconds."""
 LIGHT = np.array([0.4, -0.5, 0.77])

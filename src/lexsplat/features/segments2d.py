@@ -295,8 +295,14 @@ def pool(features: Tensor, labels: Tensor | Sequence[Tensor]) -> Tensor:
         if len(inside) == 0:
             continue
         segments = level.reshape(-1)[inside].unique(return_inverse=True)[1]
-        members = (segments.numpy(), np.arange(len(inside)))
-        sums = csr_matrix((np.ones(len(inside), np.float32), members)) @ flat[inside].numpy()
-        total[inside] += F.normalize(torch.from_numpy(sums), dim=-1)[segments]
+        number = int(segments.max()) + 1
+        members = csr_matrix(
+            (np.ones(len(inside), np.float32), (segments.numpy(), inside.numpy())), shape=(number, len(flat))
+        )
+        means = F.normalize(torch.from_numpy(members @ flat.numpy()), dim=-1)
+        total.index_add_(0, inside, means[segments])
         count[inside] += 1
-    return torch.where(count > 0, total / count.clamp_min(1), flat).reshape(features.shape)
+    total /= count.clamp_min(1)
+    alone = (count[:, 0] == 0).nonzero()[:, 0]
+    total[alone] = flat[alone]
+    return total.reshape(features.shape)

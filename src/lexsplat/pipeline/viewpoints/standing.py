@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
@@ -50,12 +50,15 @@ def standing_shares(pieces: Pieces, directions: Points) -> Points:
         hull = ConvexHull(points).equations
     except (QhullError, ValueError):  # all in one plane
         return np.zeros(len(directions))
-    near = -(points @ hull[:, :3].T + hull[:, 3]) <= deep
+    over = points @ hull[:, :3].T  # [M, F], changed in place: fresh memory takes longer than the arithmetic
+    over += hull[:, 3]
+    near = over >= -deep
     inner = ~near.any(1)
     if inner.sum() < _FEWEST_OF_A_THING:
         return np.zeros(len(directions))
-    pairs = cKDTree(points).query_pairs(link, output_type="ndarray")
-    pairs = pairs[np.lexsort(pairs.T[::-1])]  # once, instead of in each graph
+    pairs = cKDTree(points).query_pairs(link, output_type="ndarray").T
+    linked = coo_array((np.ones(pairs.shape[1], bool), pairs), shape=(len(points), len(points))).tocsr()
+    pairs = np.stack(linked.nonzero())  # sorted once, instead of in each graph
     things = _linked(pairs, inner)
     sizes = np.bincount(things[inner])
     ends, which = np.unique(np.concatenate([directions, -directions]) + 0.0, axis=0, return_inverse=True)
@@ -79,13 +82,14 @@ def standing_shares(pieces: Pieces, directions: Points) -> Points:
     return np.asarray(np.maximum(shares, 0))
 
 
-def _linked(pairs: NDArray[np.int64], members: Mask) -> NDArray[np.int64]:
-    """Number of the thing that each member is part of ``[M]``, by sorted pairs of near points ``[P, 2]``; 0 for
+def _linked(pairs: NDArray[np.int32], members: Mask) -> NDArray[np.int64]:
+    """Number of the thing that each member is part of ``[M]``, by sorted pairs of near points ``[2, P]``; 0 for
     others.
     """
-    count, numbers = int(members.sum()), np.cumsum(members) - 1
-    linked = numbers[pairs[members[pairs[:, 0]] & members[pairs[:, 1]]]]
-    graph = coo_array((np.ones(len(linked), bool), linked.T), shape=(count, count))
+    count, numbers = int(members.sum()), np.cumsum(members, dtype=np.int32) - np.int32(1)
+    first, second = numbers[np.compress(members[pairs[0]] & members[pairs[1]], pairs, axis=1)]
+    starts = np.searchsorted(first, np.arange(count + 1, dtype=np.int32)).astype(np.int32)
+    graph = csr_array((np.ones(len(first)), second, starts), shape=(count, count))
     labels = np.zeros(len(members), np.int64)
     labels[members] = connected_components(graph, directed=False)[1]
     return labels

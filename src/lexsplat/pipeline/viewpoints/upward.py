@@ -80,9 +80,10 @@ def find_upward(points: Points, look: Callable[[Points], float]) -> UpwardDirect
     candidates = up_candidates(pieces)
     directions = np.stack([direction for direction, _ in candidates])
     grounds = np.array([ground_share(pieces, direction) for direction in directions])
-    standing = standing_shares(pieces, directions)
-    plain = np.array([score + look(direction) for direction, score in candidates])
     # Without a large ground there are no walls that could be taken for a floor.
+    walls = bool((grounds > _WALL).any())
+    standing = standing_shares(pieces, directions) if walls else np.zeros(len(directions))
+    plain = np.array([score + look(direction) for direction, score in candidates])
     scores = plain + np.where(grounds > _WALL, standing * grounds, 0)
     kept: list[int] = []
     for index in np.argsort(-scores, kind="stable"):
@@ -113,7 +114,8 @@ def up_candidates(pieces: Pieces) -> list[tuple[Points, float]]:
     left = shares.copy()
     for _ in range(3):
         tried = normals[np.argsort(-left, kind="stable")[:: max(1, len(left) // 200)]]
-        support = (np.abs(normals @ tried.T) > _ALIGNED).T @ left
+        cosines = normals @ tried.T
+        support = (np.abs(cosines, out=cosines) > _ALIGNED).T @ left
         first = tried[int(support.argmax())]
         near = np.abs(normals @ first) > _ALIGNED
         mean = (normals[near] * np.sign(normals[near] @ first)[:, None] * left[near, None]).sum(0)
