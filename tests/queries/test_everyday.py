@@ -114,7 +114,7 @@ def test_the_deepest_pixel_of_a_mask_is_that_of_the_whole_picture(low):
 
 @pytest.fixture(scope="module")
 def web_like(tmp_path_factory):
-    return make_web_like(tmp_path_factory.mktemp("web_like") / "clip", seed=0)
+    return make_web_like(tmp_path_factory.mktemp("web_like") / "clip", seed=0, each=10)
 
 
 @pytest.mark.slow
