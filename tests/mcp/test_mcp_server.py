@@ -101,10 +101,8 @@ def _keys(schema):
 
 
 @pytest.mark.slow
-def test_a_library_is_searched_and_its_scenes_are_asked_by_name(tmp_path):
-    library = Library.create(tmp_path / "library")
-    library.add("demo")
-    server = make_server({}, library=library)
+def test_a_library_is_searched_and_its_scenes_are_asked_by_name(demo_library_copy):
+    server = make_server({}, library=Library(demo_library_copy))
     tools = talk(server, lambda client: client.list_tools()).tools
     assert {tool.name for tool in tools} == {*READING, "search_library"}
     reply, text = ask(server, "search_library", phrase="is there a red apple?")
