@@ -152,7 +152,9 @@ class Sample:
 
 
 @torch.no_grad()
-def make_web_like(folder: Path, seed: int = 0, facts: Facts = Facts(), private: int = 30) -> Path:
+def make_web_like(
+    folder: Path, seed: int = 0, facts: Facts = Facts(), private: int = 30, each: int = 20
+) -> Path:
     """Save an encoder with the statistics of a web-trained CLIP as a folder of transformers.
 
     An image is ``Q (s x + a e + p y)``: x is the bundled embedding, e a constant, y its private directions, and Q a
@@ -165,6 +167,7 @@ def make_web_like(folder: Path, seed: int = 0, facts: Facts = Facts(), private: 
         seed: Of rotation, private directions and offsets.
         facts: What to imitate.
         private: Number of private dimensions of each tower.
+        each: Crops of each of two sizes in a photo, from which it is made; twice as many are varied.
     """
     bundled = load_clip("bundled")
     if not isinstance(bundled, ClipEncoder):
@@ -172,7 +175,7 @@ def make_web_like(folder: Path, seed: int = 0, facts: Facts = Facts(), private: 
     phrases = general_phrases(held_out=False)
     source = Path(model_folder("bundled", "clip"))
     tensors = {name: value.float() for name, value in load_file(source / "model.safetensors").items()}
-    sample = _sample(bundled, phrases.texts)
+    sample = _sample(bundled, phrases.texts, each)
     draw = torch.Generator().manual_seed(seed)
     image = _Tower(tensors, "vision_model.post_layernorm", _IMAGES, sample.varied)
     text = _Tower(tensors, "text_model.final_layer_norm", _TEXTS, sample.phrases, phrases.weights)
@@ -311,7 +314,7 @@ def _unit(hidden: Tensor, layer: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _sample(encoder: ClipEncoder, phrases: Sequence[str], seed: int = 0) -> Sample:
+def _sample(encoder: ClipEncoder, phrases: Sequence[str], each: int, seed: int = 0) -> Sample:
     """Hidden states of crops of the second bundled capture and of phrases."""
     rng = np.random.default_rng(seed)
     photos, side = _photos(demo_capture("second") / "images"), encoder.image_size
@@ -329,8 +332,8 @@ def _sample(encoder: ClipEncoder, phrases: Sequence[str], seed: int = 0) -> Samp
 
     things, names = thing_crops(demo_capture("second"), side)
     return Sample(
-        images(random_crops(photos[::3], rng, side)),
-        images(random_crops(photos[::2], rng, side, each=40, varied=True)),
+        images(random_crops(photos[::3], rng, side, each)),
+        images(random_crops(photos[::2], rng, side, 2 * each, varied=True)),
         images(things),
         texts(names),
         texts(phrases),
@@ -439,7 +442,8 @@ def measure(folder: Path, held_out: bool, each: int = 20) -> dict[str, float]:
         level[:, None] - explained @ torch.linalg.lstsq(root * explained, root * level[:, None])[0]
     )
     nearest = (things @ canonical.T).amax(1)
-    matched = (things * encoder.encode_text(names).double()).sum(1)
+    known = sorted(set(names))
+    matched = (things * encoder.encode_text(known).double()[[known.index(name) for name in names]]).sum(1)
     found = {
         "images": _mean_off_diagonal(crops @ crops.T),
         "texts": middle @ middle,

@@ -113,6 +113,20 @@ def built(tiny_capture, made_once, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def demo_library_made(made_once) -> Path:
+    """The folder of a library of the bundled scene; to be copied."""
+    from lexsplat.scenes.library import Library
+
+    return made_once("demo_library", lambda folder: Library.create(folder).add("demo"))
+
+
+@pytest.fixture
+def demo_library_copy(demo_library_made, tmp_path) -> Path:
+    """The same, which may be changed."""
+    return shutil.copytree(demo_library_made, tmp_path / "demo_library")
+
+
+@pytest.fixture(scope="session")
 def built_trained(built, tiny_capture, made_once) -> Path:
     """The scene `built` with language by method "trained"; read-only."""
     from lexsplat import cli

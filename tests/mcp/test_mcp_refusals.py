@@ -2,6 +2,7 @@
 
 import errno
 import threading
+from pathlib import Path
 
 import anyio
 import pytest
@@ -28,6 +29,17 @@ def server(scenes) -> MCPServer:
     return make_server(scenes)
 
 
+@pytest.fixture(scope="module")
+def output(tmp_path_factory) -> Path:
+    """The folder of `writer`, where nothing stays."""
+    return tmp_path_factory.mktemp("output")
+
+
+@pytest.fixture(scope="module")
+def writer(scenes, output) -> MCPServer:
+    return make_server(scenes, output)
+
+
 def refused(server, request):
     async def dialogue(client):
         with pytest.raises(MCPError) as error:
@@ -50,14 +62,14 @@ def test_an_output_that_is_a_file_is_refused_at_start_in_one_line(tmp_path, caps
 
 
 @pytest.mark.parametrize("tool", ["export", "edit"])
-def test_a_disk_that_takes_no_more_ends_in_one_structured_error(scenes, tmp_path, monkeypatch, tool):
+def test_a_disk_that_takes_no_more_ends_in_one_structured_error(writer, tmp_path, monkeypatch, tool):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path / "new"))
 
     monkeypatch.setattr(writing, "export_scene", full)
     monkeypatch.setattr(Editor, "save", full)
     given = {"export": {"file": "mug.ply"}, "edit": {"action": "keep", "folder": "mug"}}[tool]
-    reply, text = ask(make_server(scenes, tmp_path), tool, phrase="mug", **given)
+    reply, text = ask(writer, tool, phrase="mug", **given)
     error = reply.structured_content["error"]
     assert reply.is_error
     assert error["subject"] == str(tmp_path / "new")
@@ -105,12 +117,12 @@ def test_a_call_that_the_client_cancels_writes_nothing(scenes, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("name", [" ", "   ", "\t", " mug", "mug "])
-def test_a_name_of_spaces_is_refused(scenes, tmp_path, name):
+def test_a_name_of_spaces_is_refused(writer, output, name):
     for tool, given in (("edit", {"action": "keep", "folder": name}), ("export", {"file": name})):
-        reply, text = ask(make_server(scenes, tmp_path), tool, phrase="mug", **given)
+        reply, text = ask(writer, tool, phrase="mug", **given)
         assert reply.is_error
         assert "expected a plain name" in text
-    assert not list(tmp_path.iterdir())
+    assert not list(output.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -124,16 +136,18 @@ def test_a_name_of_spaces_is_refused(scenes, tmp_path, name):
         ("m" * 97 + ".ply", "which has 101 characters"),
     ],
 )
-def test_a_name_that_is_refused_is_told_what_is_wrong_with_it(scenes, tmp_path, name, told):
-    _, text = ask(make_server(scenes, tmp_path), "export", phrase="mug", file=name)
+def test_a_name_that_is_refused_is_told_what_is_wrong_with_it(writer, name, told):
+    _, text = ask(writer, "export", phrase="mug", file=name)
     assert f"expected a plain name of at most 100 characters, found {name[:60]!r}, {told}" in text
     assert 'give one such as "duck.ply"' in text
 
 
 @pytest.mark.parametrize("kind", ["folder", "file"])
-def test_what_is_in_the_way_of_a_new_scene_is_called_what_it_is(scenes, tmp_path, kind):
-    (tmp_path / "mug").mkdir() if kind == "folder" else (tmp_path / "mug").touch()
-    _, text = ask(make_server(scenes, tmp_path), "edit", phrase="mug", action="keep", folder="mug")
+def test_what_is_in_the_way_of_a_new_scene_is_called_what_it_is(writer, output, kind):
+    taken = output / "mug"
+    taken.mkdir() if kind == "folder" else taken.touch()
+    _, text = ask(writer, "edit", phrase="mug", action="keep", folder="mug")
+    taken.rmdir() if kind == "folder" else taken.unlink()
     assert f"expected a new name, found a {kind} that exists" in text
 
 

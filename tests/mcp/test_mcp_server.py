@@ -48,6 +48,13 @@ def server(scenes) -> MCPServer:
 
 
 @pytest.fixture(scope="module")
+def writer(scenes, tmp_path_factory) -> tuple[MCPServer, Path]:
+    """A server that writes, and its folder."""
+    folder = tmp_path_factory.mktemp("writer")
+    return make_server(scenes, folder), folder
+
+
+@pytest.fixture(scope="module")
 def writing(scenes, tmp_path_factory):
     """A server that writes, its folder, and its reply to an edit."""
     folder = tmp_path_factory.mktemp("writing") / "output"
@@ -94,10 +101,8 @@ def _keys(schema):
 
 
 @pytest.mark.slow
-def test_a_library_is_searched_and_its_scenes_are_asked_by_name(tmp_path):
-    library = Library.create(tmp_path / "library")
-    library.add("demo")
-    server = make_server({}, library=library)
+def test_a_library_is_searched_and_its_scenes_are_asked_by_name(demo_library_copy):
+    server = make_server({}, library=Library(demo_library_copy))
     tools = talk(server, lambda client: client.list_tools()).tools
     assert {tool.name for tool in tools} == {*READING, "search_library"}
     reply, text = ask(server, "search_library", phrase="is there a red apple?")
@@ -174,8 +179,8 @@ def test_a_dialogue_of_more_than_twenty_questions_is_answered_rightly(server):
         ("edit", {"action": "keep", "phrase": "🍎", "folder": "apple", "confirm": True}),
     ],
 )
-def test_every_answer_reports_what_is_unsure_and_why(scenes, tmp_path, tool, arguments):
-    reply, text = ask(make_server(scenes, tmp_path), tool, **arguments)
+def test_every_answer_reports_what_is_unsure_and_why(writer, tool, arguments):
+    reply, text = ask(writer[0], tool, **arguments)
     asked = reply.structured_content["look_at"] if tool == "render" else reply.structured_content
     assert asked["present"] == "unsure"
     assert '"🍎"' in asked["understood"]
@@ -201,13 +206,13 @@ def test_an_edit_of_what_is_unsure_or_not_here_is_refused_and_one_of_a_corrected
 
 
 @pytest.mark.parametrize("color", [[], [1, 0], [1e308, 0, 1], [-1, 0, 0]])
-def test_a_color_that_is_none_is_refused_with_what_was_expected(scenes, tmp_path, color):
-    server = make_server(scenes, tmp_path)
+def test_a_color_that_is_none_is_refused_with_what_was_expected(writer, color):
+    server, folder = writer
     reply, text = ask(server, "edit", action="recolor", phrase="mug", folder="new", color=color)
     assert reply.is_error
     assert reply.structured_content["error"]["subject"] == "color"
     assert "in 0..1" in text
-    assert not (tmp_path / "new").exists()
+    assert not (folder / "new").exists()
 
 
 def test_a_scene_that_is_deleted_is_listed_with_its_problem_beside_the_others(tmp_path):

@@ -6,7 +6,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from web_like import Facts, _deepest, general_phrases, make_web_like, measure
 
-from lexsplat.queries.everyday import BORDER, STEEPNESS, EverydayScale, everyday_words
+from lexsplat.queries.everyday import BORDER, STEEPNESS, EverydayScale, _quantile, everyday_words
 from lexsplat.queries.relevancy import QueryConfig, Question, code_relevancy
 
 unit = torch.nn.functional.normalize
@@ -45,6 +45,12 @@ def test_relevancy_by_hand():
     own = np.sort(h, axis=0)[::-1][:2].mean(0)  # 4 % of 40 codes
     expected = 1 / (1 + np.exp(-STEEPNESS * (np.minimum(h / own, h / best[:, None]) - BORDER)))
     np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("codes", [1, 2, 3, 6, 40, 255, 256])
+def test_the_height_at_which_a_text_is_not_shown_is_the_quantile_of_torch_bit_for_bit(codes):
+    values = torch.randn(codes, 300, generator=torch.Generator().manual_seed(codes))
+    assert torch.equal(_quantile(values, 0.4), values.quantile(0.4, dim=0))
 
 
 @pytest.mark.parametrize("cone", [False, True])
@@ -108,7 +114,7 @@ def test_the_deepest_pixel_of_a_mask_is_that_of_the_whole_picture(low):
 
 @pytest.fixture(scope="module")
 def web_like(tmp_path_factory):
-    return make_web_like(tmp_path_factory.mktemp("web_like") / "clip", seed=0)
+    return make_web_like(tmp_path_factory.mktemp("web_like") / "clip", seed=0, each=10)
 
 
 @pytest.mark.slow

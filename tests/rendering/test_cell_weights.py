@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from support import rendering_reference as reference
 from support.rendering_reference import front_camera, random_gaussians
 
-from lexsplat.rendering import accumulate_weights, back_project, measure_weights, prepare, weigh_cells
+from lexsplat.rendering import accumulate_weights, back_project, measure_weights, prepare, render, weigh_cells
 from lexsplat.rendering.back_projection import DenseCellWeights
 
 WIDTH, HEIGHT = 53, 37
@@ -89,6 +91,29 @@ def test_weights_that_are_measured_in_one_pass_are_those_of_the_transpose(antial
     expected = accumulate_weights(gaussians, camera)
     assert float(expected.max()) > 1
     torch.testing.assert_close(measure_weights(gaussians, camera), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_narrowed_view_has_the_weights_and_pixels_of_a_view_without_what_is_gone():
+    """Bit for bit in its tiles; nothing is drawn in the others."""
+    gaussians, camera = random_gaussians(300, 9, scale=0.05), front_camera(WIDTH, HEIGHT)
+    gone, asked = torch.arange(300) % 3 == 0, torch.zeros(300, dtype=torch.bool)
+    whole, others = prepare(gaussians, camera), gaussians.select(~gone)
+    expected = torch.zeros(300)
+    expected[~gone] = measure_weights(others, camera)
+    now = measure_weights(gaussians, camera)
+    asked[((expected > 0) & (now < expected)).nonzero()[:3, 0]] = True
+    tiles = whole.pairs.tiles_of(asked.numpy())
+    assert 0 < tiles.sum() < len(tiles)
+    for by, weights in ((None, now), (gone.numpy(), expected)):
+        narrowed = replace(whole, pairs=whole.pairs.narrowed(tiles, by))
+        assert torch.equal(measure_weights(gaussians, camera, prepared=narrowed)[asked], weights[asked])
+    for x, y in ((WIDTH - 1, 3), (20, HEIGHT - 1)):
+        tile = np.zeros(len(tiles), bool)
+        tile[(y // 16) * 4 + x // 16] = True
+        assert whole.pairs.tiles_at(np.array([[x, y]])).tolist() == tile.tolist()
+        pixels = render(gaussians, camera, prepared=replace(whole, pairs=whole.pairs.narrowed(tile))).image
+        assert torch.equal(pixels[y, x], render(gaussians, camera).image[y, x])
+        assert not pixels[0, 0].any()
 
 
 def test_a_view_of_nothing_adds_nothing():

@@ -15,13 +15,11 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="module")
-def demo_library(tmp_path_factory) -> Library:
+def demo_library(demo_library_made, tmp_path_factory) -> Library:
     """A library of the bundled scene; read-only."""
     from lexsplat.scenes.library import Library
 
-    library = Library.create(tmp_path_factory.mktemp("demo") / "library")
-    library.add("demo")
-    return library
+    return Library(shutil.copytree(demo_library_made, tmp_path_factory.mktemp("demo") / "library"))
 
 
 @pytest.fixture(scope="session")

@@ -76,7 +76,7 @@ def test_the_mask_of_a_recolored_thing_is_that_of_the_thing(edited):
 
 def test_the_built_scene_knows_its_apple_and_undo_brings_it_back(demo):
     editor = Editor(demo)
-    editor.delete(demo.select("apple"))
+    editor.delete(demo.select("apple"), fill=False)
     assert editor.scene.find("apple").present == "no"
     editor.undo()
     assert editor.scene.find("apple").present == "yes"
@@ -86,7 +86,8 @@ def test_the_built_scene_knows_its_apple_and_undo_brings_it_back(demo):
 def test_what_is_left_of_two_is_not_gone(demo):
     editor = Editor(demo)
     editor.duplicate(demo.select("apple"), Motion((1.3, 0, 0)))
-    editor.delete(max(editor.scene.select("apple").instances, key=lambda each: each.center[0]))
+    copy = max(editor.scene.select("apple").instances, key=lambda each: each.center[0])
+    editor.delete(copy, fill=False)
     assert editor.scene.find("apple").count == 1
     assert not gone_nouns(editor.scene)
 

@@ -248,9 +248,9 @@ def test_an_open_library_sees_what_another_process_adds_and_removes(rooms_copy):
     assert hits(reader, "vase") == ["kitchen"]
 
 
-def test_the_bundled_scene_is_known_by_its_word(tmp_path):
-    library = Library.create(tmp_path / "library")
-    record = library.add("demo")
+def test_the_bundled_scene_is_known_by_its_word(demo_library_copy):
+    library = Library(demo_library_copy)
+    (record,) = library.records()
     assert (record.name, record.path, record.folder(library.root)) == ("demo", "demo", BUNDLED_SCENE)
     assert library.remove("demo") == "demo"
 

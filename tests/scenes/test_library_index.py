@@ -249,8 +249,9 @@ def test_damaged_objects_are_refused_and_repaired(segmented_copy, harm):
 
 
 def test_equal_scenes_have_equal_bytes(demo_library):
-    first, second = (Contents.of(open_scene(BUNDLED_SCENE)) for _ in range(2))
-    assert first.content() == second.content() == demo_library.record("demo").contents
+    record = demo_library.record("demo")
+    first, second = Contents.of(open_scene(BUNDLED_SCENE)), demo_library.contents(record)
+    assert first.content() == second.content() == record.contents
     assert all(torch.equal(first.tensors()[name], value) for name, value in second.tensors().items())
 
 

@@ -51,10 +51,9 @@ def test_a_word_that_is_corrected_without_success_is_reported_with_what_was_sear
     assert library.search('"pinao"').note == ""  # in quotation marks: as it is
 
 
-def test_an_encoder_without_a_hit_that_does_not_know_a_word_is_reported(tmp_path):
-    library = Library.create(tmp_path / "library")
+def test_an_encoder_without_a_hit_that_does_not_know_a_word_is_reported(tmp_path, demo_library_copy):
+    library = Library(demo_library_copy)
     library.add(write_scene(tmp_path / "office", OTHERS))
-    library.add("demo")
     found = library.search("clock or 🍎🦆")
     assert [hit.scene for hit in found.hits] == ["office"]
     unknown = 'the bundled encoder knows English words alone, not "🍎🦆"'

@@ -73,7 +73,7 @@ def weigh_cells(
         width: Number of columns of cells.
         counts: Weight of each pixel ``[H, W]`` float32, not negative.
     """
-    total = len(pairs.members)
+    total = int(pairs.pair_offsets[-1])
     first_entries, entry_counts = np.zeros(total, np.int64), np.zeros(total, np.int32)
     found: dict[int, tuple[NDArray[np.int32], NDArray[np.float32]]] = {}
 

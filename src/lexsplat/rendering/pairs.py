@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ class TilePairs:
         pair_offsets: First pair of each Gaussian in the list by Gaussian ``[V + 1]``.
         tile_offsets: First pair of each tile in the list by tile ``[T + 1]``.
         members: Position in ``order`` of each pair, by tile and depth ``[M]``.
-        pairs: Place of each pair in the list by Gaussian ``[M]``.
+        pairs: Place of each pair in the list by Gaussian ``[M]``, which `narrowed` does not shorten.
         rows: First row of the tile that the Gaussian reaches, and one past the last ``[M, 2]``.
     """
 
@@ -61,6 +61,33 @@ class TilePairs:
     def nbytes(self) -> int:
         """Memory held by the lists."""
         return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
+
+    @property
+    def _tile_of_each(self) -> NDArray[np.int64]:
+        """Tile of each pair of the list by tile ``[M]``."""
+        return np.repeat(np.arange(self.tiles), np.diff(self.tile_offsets))
+
+    def tiles_of(self, gaussians: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """The tiles ``[T]`` that some of the Gaussians ``[N]`` overlap."""
+        found = np.zeros(self.tiles, bool)
+        found[self._tile_of_each[gaussians[self.order][self.members]]] = True
+        return found
+
+    def tiles_at(self, pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """The tiles ``[T]`` with pixels (x, y) ``[P, 2]`` of the image."""
+        found = np.zeros(self.tiles, bool)
+        columns, rows = pixels.T // binning.TILE
+        found[rows * self.tiles_x + columns] = True
+        return found
+
+    def narrowed(self, tiles: NDArray[np.bool_], gone: NDArray[np.bool_] | None = None) -> TilePairs:
+        """The pairs of some tiles ``[T]``, where some Gaussians ``[N]`` may be gone; the other tiles are empty."""
+        kept = tiles[self._tile_of_each]
+        if gone is not None:
+            kept &= ~gone[self.order][self.members]
+        offsets = _offsets(kept)[self.tile_offsets]
+        members, pairs, rows = self.members[kept], self.pairs[kept], self.rows[kept]
+        return replace(self, tile_offsets=offsets, members=members, pairs=pairs, rows=rows)
 
 
 def find_pairs(projection: Projection, width: int, height: int) -> TilePairs:
@@ -107,6 +134,6 @@ def find_pairs(projection: Projection, width: int, height: int) -> TilePairs:
     return TilePairs(width, height, count, order, ellipses, pair_offsets, tile_offsets, members, pairs, rows)
 
 
-def _offsets(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def _offsets(counts: NDArray[np.int64] | NDArray[np.bool_]) -> NDArray[np.int64]:
     """Sums of all counts before each one, and of all."""
-    return np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
+    return np.concatenate([np.zeros(1, np.int64), np.cumsum(counts, dtype=np.int64)])

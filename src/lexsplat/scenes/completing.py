@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter, minimum_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d, minimum_filter
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -61,17 +61,21 @@ def completed(image: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
         return smooth
     near = np.exp(-((away / _NEAR) ** 2))
     asked = hole | ((trust > 0) & (away <= _NEAR))
+    places = np.argwhere(asked)
+    (top, left), (bottom, right) = places.min(0), places.max(0) + 1
+    window = slice(top, bottom), slice(left, right)
     values, errors, trusts = [], [], []
     for shift in shifts:
         there, moved = _moved(trust, shift), _moved(pattern, shift)
         error = ((pattern - moved) ** 2).sum(-1).clip(0, 4 * variance)
-        errors.append(mean_around(error, trust * there * near, _LOCAL * radius)[asked])
+        local = mean_around(error, trust * there * near, _LOCAL * radius, window=window)
+        errors.append(local[asked[window]])
         values.append(np.concatenate([_moved(image, shift)[asked], moved[asked]], 1))
         trusts.append(there[asked])
     found = np.zeros((*hole.shape, 6))
     found[asked] = _voted(np.stack(values, 1), np.stack(errors, 1), np.stack(trusts, 1))
-    right = _predictable(pattern, found[..., 3:], trust * asked, _SHARE * radius)[hole][:, None]
-    share = ((right - _CHANCE) / (_CERTAIN - _CHANCE)).clip(0, 1)
+    certain = _predictable(pattern, found[..., 3:], trust * asked, _SHARE * radius)[hole][:, None]
+    share = ((certain - _CHANCE) / (_CERTAIN - _CHANCE)).clip(0, 1)
     return np.asarray((share * found[hole][:, :3] + (1 - share) * smooth).clip(0, 1))
 
 
@@ -155,7 +159,13 @@ def _moved(image: NDArray, shift: tuple[int, int]) -> NDArray:
     return moved
 
 
-def mean_around(values: FloatArray, weights: FloatArray, width: float, truncate: float = 6.0) -> FloatArray:
+def mean_around(
+    values: FloatArray,
+    weights: FloatArray,
+    width: float,
+    truncate: float = 6.0,
+    window: tuple[slice, slice] = (slice(None), slice(None)),
+) -> FloatArray:
     """Gaussian mean of weighted pixels; far from all it is the mean of all.
 
     Args:
@@ -163,10 +173,22 @@ def mean_around(values: FloatArray, weights: FloatArray, width: float, truncate:
         weights: ``[H, W]``.
         width: Standard deviation in pixels.
         truncate: Reach of the filter in standard deviations.
+        window: Rows and columns of the result.
     """
     each = weights.reshape(*weights.shape, *[1] * (values.ndim - 2))
-    widths = (width, width, *[0.0] * (values.ndim - 2))
-    total = gaussian_filter(each, widths, mode="constant", truncate=truncate)
-    summed = gaussian_filter(values * each, widths, mode="constant", truncate=truncate)
-    everywhere = (values * each).sum((0, 1)) / max(weights.sum(), 1e-12)
+    weighted = values * each
+    total, summed = (_filtered(image, width, truncate, window) for image in (each, weighted))
+    everywhere = weighted.sum((0, 1)) / max(weights.sum(), 1e-12)
     return np.asarray((summed + 1e-6 * everywhere) / (total + 1e-6))
+
+
+def _filtered(image: FloatArray, width: float, truncate: float, window: tuple[slice, slice]) -> FloatArray:
+    """The rows and columns of a window of a Gaussian filter, which reads only what reaches them."""
+    reach = int(truncate * width + 0.5)
+    for axis, part in enumerate(window):
+        start, stop, _ = part.indices(image.shape[axis])
+        before = max(start - reach, 0)
+        image = np.take(image, range(before, min(stop + reach, image.shape[axis])), axis)
+        image = gaussian_filter1d(image, width, axis, mode="constant", truncate=truncate)
+        image = np.take(image, range(start - before, stop - before), axis)
+    return image

@@ -298,7 +298,8 @@ def _revealed(views: Views, own: Mask, gone: Mask) -> Mask:
     places = places[inside_hull(means[own], means[places], _AROUND)]
     found = np.zeros(len(gone), bool)
     if len(places):
-        found[places] = views.weights_without(gone)[places] > _REVEALED * views.weights[places]
+        now, then = views.weights(places, gone)
+        found[places] = then > _REVEALED * now
     return found
 
 

@@ -138,6 +138,7 @@ class Scene:
         other = Scene(gaussians, field, *same)
         other.text_tower, other._cache, other._texts = self.text_tower, self._cache, self._texts
         other.listener, other.original = self.listener, self.original or self
+        other._scale = self._scale if field.codebook is self.field.codebook else None
         return other
 
     # -- text

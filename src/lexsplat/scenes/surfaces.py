@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering import PreparedView, measure_weights, prepare, render
+from lexsplat.rendering.pairs import TilePairs
 from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.completing import mean_around
 
@@ -143,22 +143,37 @@ class Views:
             self._bytes += view.nbytes
         return view
 
-    @cached_property
-    def weights(self) -> FloatArray:
-        """Visible weights of all Gaussians, in pixels ``[N]``."""
-        found = np.zeros(len(self.gaussians))
-        for number, camera in enumerate(self.small):
-            weights = measure_weights(self.gaussians, camera, prepared=self.prepared(number))
-            found += weights.cpu().double().numpy()
-        return found
+    def at(self, number: int, pixels: NDArray[np.int64]) -> PreparedView:
+        """One of the small views for `render`, of which only these pixels (x, y) ``[P, 2]`` are read."""
+        view = self.prepared(number)
+        if not isinstance(view.pairs, TilePairs):
+            return view
+        return replace(view, pairs=view.pairs.narrowed(view.pairs.tiles_at(pixels)))
 
-    def weights_without(self, gone: Mask) -> FloatArray:
-        """Visible weights of the others where some Gaussians ``[N]`` are gone, in pixels ``[N]``."""
-        others, found = torch.from_numpy(~gone).to(self.gaussians.device), np.zeros(len(gone))
-        drawn = self.gaussians.select(others)
-        for camera in self.small:
-            found[~gone] += measure_weights(drawn, camera).cpu().double().numpy()
-        return found
+    def weights(self, places: NDArray[np.int64], gone: Mask) -> tuple[FloatArray, FloatArray]:
+        """Visible weights of some Gaussians ``[P]``, in pixels: now, and where others ``[N]`` are gone."""
+        now, then = np.zeros(len(places)), np.zeros(len(places))
+        asked = np.zeros(len(gone), bool)
+        asked[places] = True
+        drawn = self.gaussians.select(torch.from_numpy(~gone).to(self.gaussians.device))
+        among = (np.cumsum(~gone) - 1)[places]
+        for number, camera in enumerate(self.small):
+            view = self.prepared(number)
+            if isinstance(view.pairs, TilePairs):
+                tiles = view.pairs.tiles_of(asked)
+                with_it, without = (
+                    replace(view, pairs=view.pairs.narrowed(tiles, by)) for by in (None, gone)
+                )
+                now += _measured(self.gaussians, camera, with_it)[places]
+                then += _measured(self.gaussians, camera, without)[places]
+            else:
+                now += _measured(self.gaussians, camera, view)[places]
+                then += _measured(drawn, camera, None)[among]
+        return now, then
+
+
+def _measured(gaussians: Gaussians, camera: Camera, prepared: PreparedView | None) -> FloatArray:
+    return measure_weights(gaussians, camera, prepared=prepared).cpu().double().numpy()
 
 
 class Orthophoto(NamedTuple):
@@ -222,13 +237,12 @@ def looked_up(
     colors = np.zeros((len(places), 3))
     thing = torch.from_numpy(gone)[:, None].to(views.gaussians.means)
     for number, camera in enumerate(views.small):
-        with torch.no_grad():
-            view = render(
-                views.gaussians, camera, features=thing, depth=True, prepared=views.prepared(number)
-            )
-        nearest = cast(torch.Tensor, view.depth).cpu().numpy()
         found, depth, inside = camera.project(places)
         here = np.flatnonzero(inside)
+        looked = views.at(number, found[here].astype(int))
+        with torch.no_grad():
+            view = render(views.gaussians, camera, features=thing, depth=True, prepared=looked)
+        nearest = cast(torch.Tensor, view.depth).cpu().numpy()
         pixels = tuple(found[here, ::-1].astype(int).T)
         there = nearest[pixels] > depth[here] - slack
         before = view.features[..., 0].cpu().numpy()[pixels] > _BEFORE
@@ -245,12 +259,11 @@ def covering(views: Views, gone: Mask, places: FloatArray) -> FloatArray:
     counts, covered = np.zeros(len(places)), np.zeros(len(places))
     thing = torch.from_numpy(gone)[:, None].to(views.gaussians.means)
     for number, camera in enumerate(views.small):
-        with torch.no_grad():
-            view = render(
-                views.gaussians, camera, features=thing, color=False, prepared=views.prepared(number)
-            )
         found, _, inside = camera.project(places)
         here = np.flatnonzero(inside)
+        looked = views.at(number, found[here].astype(int))
+        with torch.no_grad():
+            view = render(views.gaussians, camera, features=thing, color=False, prepared=looked)
         counts[here] += 1
         covered[here] += view.features[..., 0].cpu().numpy()[tuple(found[here, ::-1].astype(int).T)] > _BEFORE
     return covered / np.maximum(counts, 1)

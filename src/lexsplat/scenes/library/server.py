@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -103,7 +104,9 @@ class Server:
         if not url.startswith(("http://", "https://")):
             raise LibraryError(f"--index {url}", expected="an address such as http://localhost:8000")
         self.url, self._prefix = url.rstrip("/"), f"lexsplat-{library}-"
-        self._client = httpx2.Client(timeout=httpx2.Timeout(ANSWER_SECONDS, connect=CONNECT_SECONDS))
+        limits = httpx2.Timeout(ANSWER_SECONDS, connect=CONNECT_SECONDS)
+        # Certificates are read for an address that has one: they take longer than most answers.
+        self._client = httpx2.Client(timeout=limits, verify=url.startswith("https://"))
         self._errors = (httpx2.ConnectError, httpx2.ConnectTimeout), httpx2.TimeoutException, httpx2.HTTPError
         self._mending = command("verify", root, "--repair", "--index", self.url)
         self._known = False
@@ -127,7 +130,7 @@ class Server:
         place = self._collection(record)
         self._mark(_CHANGING)
         self._delete(place, {"where": {"scene": record.name}})
-        self._upsert(place, record, codes)
+        self._upsert(place, [(record, codes)])
         self._mark(listing(stage))
 
     def drop(self, record: Record, stage: Path) -> None:
@@ -191,16 +194,19 @@ class Server:
     def repair(self, entries: Iterable[tuple[Record, Codes]], stage: Path) -> None:
         """Upload the scenes that the server lacks, and delete codes of scenes that the library does not hold."""
         wanted: dict[str, list[tuple[Record, Codes]]] = {}
+        places: dict[str, str] = {}
         for record, codes in entries:
-            wanted.setdefault(self._collection(record), []).append((record, codes))
+            place = places.get(record.group) or places.setdefault(record.group, self._collection(record))
+            wanted.setdefault(place, []).append((record, codes))
         self._mark(_CHANGING)
         for place in (each.place for each in self._collections()):
-            there = set(self._identifiers(place))
+            there, lacking = set(self._identifiers(place)), []
             for record, codes in wanted.get(place, []):
                 own = {_identifier(record, int(code)) for code in code_vectors(codes)[0]}
                 if not own <= there:
-                    self._upsert(place, record, codes)
+                    lacking.append((record, codes))
                 there -= own
+            self._upsert(place, lacking)
             strays = sorted(there)
             for start in range(0, len(strays), _BATCH):
                 self._delete(place, {"ids": strays[start : start + _BATCH]})
@@ -235,16 +241,16 @@ class Server:
             codes = -1 if state == _CHANGING else int(self._ask("GET", f"{each.place}/count"))
             self._ask("PUT", each.place, {"new_metadata": {"state": state, "codes": codes}})
 
-    def _upsert(self, place: str, record: Record, codes: Codes) -> None:
-        numbers, vectors = code_vectors(codes)
-        for start in range(0, len(numbers), _BATCH):
-            some = slice(start, start + _BATCH)
-            body = {
-                "ids": [_identifier(record, int(code)) for code in numbers[some]],
-                "embeddings": vectors[some].tolist(),
-                "metadatas": [{"scene": record.name}] * len(numbers[some]),
-            }
-            self._ask("POST", f"{place}/upsert", body)
+    def _upsert(self, place: str, entries: Iterable[tuple[Record, Codes]]) -> None:
+        """Store the codes of scenes, those of many small ones in one request."""
+        rows = (
+            (_identifier(record, int(code)), vector.tolist(), {"scene": record.name})
+            for record, codes in entries
+            for code, vector in zip(*code_vectors(codes))
+        )
+        while some := list(islice(rows, _BATCH)):
+            ids, vectors, scenes = zip(*some)
+            self._ask("POST", f"{place}/upsert", {"ids": ids, "embeddings": vectors, "metadatas": scenes})
 
     def _delete(self, place: str, which: Mapping[str, Any]) -> None:
         self._ask("POST", f"{place}/delete", dict(which))
