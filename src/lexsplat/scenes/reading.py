@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from lexsplat.features.hub import content_hash, loaded_files, model_folder, present_name
+from lexsplat.features.hub import content_hash, model_folder, present_name
 from lexsplat.features.text import check_encoder
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField, field_from_tensors
 from lexsplat.queries.relevancy import QueryConfig
 from lexsplat.runtime.errors import FileFormatError, SceneFolderError
 from lexsplat.runtime.files import read_tensors
-from lexsplat.runtime.fingerprints import file_stamp
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.previous import version_that_answers
 from lexsplat.scenes.views import StoredView
@@ -55,18 +53,7 @@ class SceneContent:
             return name
         if name != built_with:  # known words would be answered without the encoder
             check_encoder(name, content_hash(model_folder(name, "clip"), "clip"), needed)
-        return name if needed != _hash_of_bundled() else "bundled"
-
-
-def _hash_of_bundled() -> str:
-    """The hash of the bundled encoder; a process that opens many scenes computes it once."""
-    folder = model_folder("bundled", "clip")
-    return _hash_of(folder, tuple(file_stamp(path) for path in loaded_files(folder, "clip")))
-
-
-@lru_cache(maxsize=1)
-def _hash_of(folder: Path, stamps: tuple[tuple[int, int], ...]) -> str:
-    return content_hash(folder, "clip")
+        return name if needed != content_hash(model_folder("bundled", "clip"), "clip") else "bundled"
 
 
 def read_scene(path: Path, device: str) -> SceneContent:
