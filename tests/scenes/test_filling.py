@@ -108,13 +108,20 @@ def test_a_thing_that_stands_on_a_deleted_one_stays_whole():
     assert int((editor.scene.gaussians.means[:, 2] > 0.03).sum()) == len(block)
 
 
+@pytest.fixture(scope="module")
+def moved(tmp_path_factory):
+    """A table with a ball, and the two lines of a journal that moves the ball; read-only."""
+    scene, world = table_with_a_ball()
+    journal = tmp_path_factory.mktemp("moved") / "edits.jsonl"
+    Editor(scene, journal).move(ball_of(scene, world), Motion(translation=(1.0, 0, 0)))
+    return scene, journal.read_text().splitlines()
+
+
 @pytest.mark.parametrize("undone", [False, True])
 @pytest.mark.parametrize("broken", ["####", None, 5, "", "the mask"])
-def test_damaged_remains_of_a_moved_thing_are_reported_in_one_line(tmp_path, broken, undone):
-    scene, world = table_with_a_ball()
+def test_damaged_remains_of_a_moved_thing_are_reported_in_one_line(moved, tmp_path, broken, undone):
+    scene, (header, line) = moved
     journal = tmp_path / "edits.jsonl"
-    Editor(scene, journal).move(ball_of(scene, world), Motion(translation=(1.0, 0, 0)))
-    header, line = journal.read_text().splitlines()
     step = json.loads(line)
     changed = json.dumps({**step, "remains": step["mask"] if broken == "the mask" else broken})
     journal.write_text(f"{header}\n{changed}\n" + ('{"undo": true}\n' if undone else ""))
@@ -123,11 +130,9 @@ def test_damaged_remains_of_a_moved_thing_are_reported_in_one_line(tmp_path, bro
     assert "\n" not in str(error.value)
 
 
-def test_an_undone_step_that_cannot_be_replayed_is_reported_in_one_line(tmp_path):
-    scene, world = table_with_a_ball()
+def test_an_undone_step_that_cannot_be_replayed_is_reported_in_one_line(moved, tmp_path):
+    scene, (header, line) = moved
     journal = tmp_path / "edits.jsonl"
-    Editor(scene, journal).move(ball_of(scene, world), Motion(translation=(1.0, 0, 0)))
-    header, line = journal.read_text().splitlines()
     journal.write_text(f'{header}\n{json.dumps({**json.loads(line), "scale": -1})}\n{{"undo": true}}\n')
     editor = Editor(scene, journal)
     with pytest.raises(FileFormatError, match="replayed"):
