@@ -279,6 +279,7 @@ def test_panoramas_are_refused_with_a_remedy(tmp_path):
     fails(tmp_path, "cameras.bin", "EQUIRECTANGULAR", kind=CaptureError)
 
 
+@pytest.mark.slow
 def test_bonsai_is_loaded_with_points_and_masks():
     capture = load_capture(shared_data("bonsai"), downscale=4)
     assert len(capture.views) == 292
@@ -291,6 +292,7 @@ def test_bonsai_is_loaded_with_points_and_masks():
     assert capture.views["DSCF5805.JPG"].load_image().shape == (133, 200, 3)
 
 
+@pytest.mark.slow
 def test_points_of_bonsai_fall_on_pixels_of_their_color():
     capture = load_capture(shared_data("bonsai"))
     view = capture.views["DSCF5600.JPG"]

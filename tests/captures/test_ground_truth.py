@@ -316,6 +316,7 @@ def test_a_given_folder_whose_labels_hold_no_objects_is_refused(lerf_ovs, tmp_pa
         load_annotations(load_capture(lerf_ovs), folder)
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(st.integers(-5, 45), st.integers(-5, 35)), min_size=3, max_size=9))
 def test_a_polygon_mask_covers_its_inside_and_stays_in_its_bounding_box(points):
     found = polygon_mask(points, 40, 30)

@@ -27,6 +27,7 @@ def options_of(page: str) -> set[str]:
     return {word for line in lines if line.startswith("-") for word in re.findall(r"--[\w.-]*\w", line)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", cli.COMMANDS)
 def test_help_pages_have_words_for_placeholders_and_defaults(command, capsys):
     page = help_page(capsys, command, "--help")
@@ -63,6 +64,7 @@ def test_the_help_page_of_build_states_which_methods_use_dino(capsys, monkeypatc
     assert 'Method "trained" uses it, and "averaged" where CLIP is read at class tokens alone' in page
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "rare"),
     [
@@ -79,6 +81,7 @@ def test_rare_options_are_on_the_whole_page_only(command, rare, capsys):
     assert rare <= options_of(help_page(capsys, command, "--help-all"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["build", "reconstruct", "language", "compare", "ablate"])
 def test_help_shows_what_people_use_and_help_all_the_rest(command, capsys):
     short = help_page(capsys, command, "--help")

@@ -34,6 +34,7 @@ def in_words(values, unit: str) -> str:
     return f"({', '.join(f'{value:.{digits}f}' for value in values)}) {unit}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [["list"], ["find", "red apple"], ["ask", "where is the red apple?"]])
 def test_positions_are_printed_in_meters_where_the_scale_is_known_and_in_scene_units_elsewhere(
     scaled, apple, capsys, command

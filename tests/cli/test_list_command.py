@@ -51,6 +51,7 @@ def test_objects_share_no_gaussian(demo):
     assert int(shared.max()) == 1
 
 
+@pytest.mark.slow
 def test_a_thing_that_no_view_shows_is_not_listed_and_the_others_are(demo, monkeypatch):
     unseen = next(thing for thing in demo.objects if thing.phrase == "rubber duck").mask | demo.hidden
     monkeypatch.setattr(type(demo), "hidden", property(lambda _: unseen))

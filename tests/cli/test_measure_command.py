@@ -31,6 +31,7 @@ def printed(capsys, *arguments: str) -> str:
     return capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_lengths_are_those_of_the_boxes_and_the_points(mug_and_banana, scaled, capsys):
     mug, banana = mug_and_banana
     points, others = (thing.selected.means.detach().double().numpy() for thing in mug_and_banana)
@@ -50,6 +51,7 @@ def test_lengths_are_those_of_the_boxes_and_the_points(mug_and_banana, scaled, c
         assert known[name]["meters"] == pytest.approx(METERS * known[name]["units"], abs=1e-5), name
 
 
+@pytest.mark.slow
 def test_lengths_are_printed_in_scene_units_and_in_meters_where_they_are_known(
     mug_and_banana, scaled, capsys
 ):

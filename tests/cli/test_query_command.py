@@ -99,6 +99,7 @@ def test_an_unknown_view_is_refused_with_the_names_of_views(built, capsys):
     fails_in_one_line(capsys, ["query", str(built), "x", "--view", "nowhere"], "nowhere", "view_01.png")
 
 
+@pytest.mark.slow
 def test_a_long_prompt_is_shortened_for_display_and_whole_in_json(capsys):
     prompt = " ".join(["apple"] * 90)
     for command in (["find", "demo", prompt], ["query", "demo", prompt, "--no-images"]):

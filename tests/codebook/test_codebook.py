@@ -193,6 +193,7 @@ def test_assign_in_blocks_equals_assign_at_once(monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_array_equal(book.assign(maps["v0"]), whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings_", [CodebookConfig(num_codes=6), CodebookConfig(num_codes=6).as_in_paper()]
 )
@@ -282,6 +283,7 @@ def test_the_fit_depends_on_the_seed_only() -> None:
     assert torch.equal(first.dino, second.dino)
 
 
+@pytest.mark.slow
 def test_fit_and_assignment_are_bit_identical_on_any_number_of_threads() -> None:
     # Batches so large that torch would spread them over its threads.
     generator = torch.Generator().manual_seed(8)
@@ -315,6 +317,7 @@ def test_without_dino_the_codebook_has_no_dino_part() -> None:
     np.testing.assert_array_equal(book.assign(maps["v1"]), book.assign(plain["v1"]))
 
 
+@pytest.mark.slow
 def test_load_balancing_uses_more_codes_than_its_ablation() -> None:
     # Small start and a rare group: without the loss most codes never win a feature.
     maps, _ = clustered_maps(7, groups=4)

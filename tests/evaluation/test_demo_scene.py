@@ -37,6 +37,7 @@ def read_mask(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path))
 
 
+@pytest.mark.slow
 def test_pictures_are_complete_and_of_one_size(name):
     size, views, _, _, _ = EXPECTED[name]
     pictures = sorted((CAPTURES / name / "images").glob("*.jpg"))
@@ -47,6 +48,7 @@ def test_pictures_are_complete_and_of_one_size(name):
             assert (image.size, image.mode) == (size, "RGB")
 
 
+@pytest.mark.slow
 def test_pictures_are_neither_over_exposed_nor_flat(name):
     for picture in sorted((CAPTURES / name / "images").glob("*.jpg"))[::5]:
         image = np.asarray(Image.open(picture))
@@ -80,6 +82,7 @@ def test_all_views_are_posed_and_points_come_from_training_views_only(name):
     assert all((count == 0) == (image in out) for image, count in seen_in.items())
 
 
+@pytest.mark.slow
 def test_points_project_to_where_they_were_seen(name):
     model = pycolmap.Reconstruction(CAPTURES / name / "sparse" / "0")
     (camera,) = model.cameras.values()
@@ -96,6 +99,7 @@ def test_points_project_to_where_they_were_seen(name):
     assert np.mean(np.concatenate(errors)) < 1.0
 
 
+@pytest.mark.slow
 def test_masks_are_binary_nonempty_and_of_the_pictures_size(name):
     size = EXPECTED[name][0]
     found = masks(name)
@@ -148,6 +152,7 @@ def test_scene_is_small(name):
     assert sum(path.stat().st_size for path in files) < EXPECTED[name][4]
 
 
+@pytest.mark.slow
 def test_loads_as_a_scene_with_its_own_split_and_masks(name):
     _, views, count, points, _ = EXPECTED[name]
     scene = load_capture(CAPTURES / name)

@@ -38,6 +38,7 @@ def row(bench, calls, name="mine", settings=()):
     return Row(name, settings, make)
 
 
+@pytest.mark.slow
 def test_features_have_dino_whatever_the_method_of_the_settings(open_bench):
     bench = open_bench()
     assert bench.config.method == "averaged"
@@ -45,6 +46,7 @@ def test_features_have_dino_whatever_the_method_of_the_settings(open_bench):
     assert list(bench.folder.record["stages"]) == ["reconstruct", "features"]
 
 
+@pytest.mark.slow
 def test_a_codebook_is_made_once_and_again_if_its_file_is_damaged(open_bench):
     bench = open_bench()
     first, maps, _ = bench.codebook(CONFIG.codebook, 0)
@@ -61,6 +63,7 @@ def test_a_codebook_is_made_once_and_again_if_its_file_is_damaged(open_bench):
     assert path.stat().st_size > 100
 
 
+@pytest.mark.slow
 def test_a_run_is_kept_until_its_settings_change_or_its_file_is_damaged(open_bench):
     bench, calls = open_bench(), []
     first = bench.run(row(bench, calls), 0)
@@ -76,6 +79,7 @@ def test_a_run_is_kept_until_its_settings_change_or_its_file_is_damaged(open_ben
     assert json.loads(path.read_text())["name"] == "mine"
 
 
+@pytest.mark.slow
 def test_every_file_is_written_after_every_run_and_both_commands_keep_their_own(open_bench):
     bench = open_bench()
 

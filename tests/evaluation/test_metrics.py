@@ -27,6 +27,7 @@ def test_psnr_of_a_constant_difference_of_a_tenth_is_20_db():
     assert metrics.psnr(random_image(0), random_image(0)) == math.inf
 
 
+@pytest.mark.slow
 def test_psnr_agrees_with_scikit_image():
     from skimage.metrics import peak_signal_noise_ratio
 
@@ -80,6 +81,7 @@ def test_without_torchvision_lpips_is_refused_before_torchmetrics_loads(monkeypa
 # Relevancy maps, strict protocol
 
 
+@pytest.mark.slow
 @given(SCORES, MASKS, st.integers(0, 1000))
 def test_mask_scores_agree_with_scikit_learn_at_every_threshold(scores, ground_truth, step):
     import sklearn.metrics
@@ -116,6 +118,7 @@ def test_ground_truth_must_be_boolean_and_of_the_shape_of_the_scores():
             metrics.threshold_counts(np.zeros((2, 2)), mask)
 
 
+@pytest.mark.slow
 @given(SCORES, MASKS.filter(np.any))
 def test_average_precision_agrees_with_scikit_learn_interpolated_at_101_recalls(scores, ground_truth):
     import sklearn.metrics
@@ -126,6 +129,7 @@ def test_average_precision_agrees_with_scikit_learn_interpolated_at_101_recalls(
     assert metrics.average_precision(scores, ground_truth) == pytest.approx(np.mean(expected))
 
 
+@pytest.mark.slow
 @given(SCORES, MASKS)
 def test_average_precision_is_bounded_and_deaf_to_monotone_changes(scores, ground_truth):
     value = metrics.average_precision(scores, ground_truth)

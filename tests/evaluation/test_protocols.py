@@ -95,6 +95,7 @@ def test_a_predicted_soft_pixel_is_a_true_and_a_false_positive_in_the_official_p
     assert found.precision == pytest.approx(hits / (hits + alarms))
 
 
+@pytest.mark.slow
 @given(SCORES, MASKS)
 def test_official_scores_are_bounded(scores, mask):
     found = protocols.official_scores(scores, mask)
@@ -103,6 +104,7 @@ def test_official_scores_are_bounded(scores, mask):
     assert found.average_precision <= 1.0101
 
 
+@pytest.mark.slow
 @given(SCORES, MASKS.filter(np.any))
 def test_official_masks_agree_with_scikit_learn_where_nothing_is_resized(scores, mask):
     import sklearn.metrics
@@ -186,6 +188,7 @@ def test_the_majority_is_that_of_scipys_filter_away_from_the_border(mask):
     np.testing.assert_array_equal(found[3:-4, 3:-4], expected[3:-4, 3:-4].astype(bool))
 
 
+@pytest.mark.slow
 @given(SCORES, MASKS.filter(np.any))
 def test_lerf_2d_is_bounded(scores, mask):
     found = protocols.lerf_2d_scores(scores, mask)
@@ -208,6 +211,7 @@ def test_lerf_2d_refuses_a_map_of_another_size():
 # LERF-OVS in 3D
 
 
+@pytest.mark.slow
 @given(SCORES, MASKS)
 def test_silhouettes_agree_with_scikit_learn(alpha, ground_truth):
     import sklearn.metrics

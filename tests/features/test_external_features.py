@@ -225,6 +225,7 @@ def test_segments_of_another_size_are_reported_before_structure_from_motion_and_
     )
 
 
+@pytest.mark.slow
 def test_features_of_another_depth_are_reported_before_the_reconstruction(
     tiny_capture, segments, tmp_path, monkeypatch
 ):

@@ -101,6 +101,7 @@ def test_levels_of_different_sizes_are_aligned():
     assert error.abs().max() < 2e-3
 
 
+@pytest.mark.slow
 def test_random_crops_put_embeddings_at_their_true_centers():
     width, height = 160, 120
     rng = np.random.default_rng(0)

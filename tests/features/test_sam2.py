@@ -25,6 +25,7 @@ def photo():
     return torch.rand(3, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
 
 
+@pytest.mark.slow
 def test_masks_of_the_grid_equal_those_of_transformers_point_by_point(folder, photo):
     from transformers import Sam2Model
 
@@ -43,6 +44,7 @@ def test_masks_of_the_grid_equal_those_of_transformers_point_by_point(folder, ph
         torch.testing.assert_close(scores[9 * row + column], one.iou_scores[0, 0], atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_photo_has_three_levels_of_segments_the_same_each_time(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(sam2, "CONFIDENT", -np.inf)  # random weights are confident of nothing
     monkeypatch.setattr(sam2, "STABLE", 0.0)
@@ -55,6 +57,7 @@ def test_a_photo_has_three_levels_of_segments_the_same_each_time(folder, tmp_pat
     np.testing.assert_array_equal(segmenter.labels(view, (12, 8)), found)
 
 
+@pytest.mark.slow
 def test_the_published_class_for_videos_gives_the_masks_of_its_photo_part(folder, photo, tmp_path):
     video = Sam2Segmenter(write_sam2(tmp_path / "video", video=True), "video", points=3)
     expected, scores = Sam2Segmenter(folder, "photo", points=3).masks(photo, (16, 16))

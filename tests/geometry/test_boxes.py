@@ -64,6 +64,7 @@ def rotated(points, angle):
     return points @ turned(angle).axes
 
 
+@pytest.mark.slow
 @given(st.floats(0, 1.5), st.integers(0, 5))
 @settings(max_examples=20)
 def test_a_box_around_a_rotated_block_has_the_size_and_center_of_the_block(angle, seed):
@@ -142,6 +143,7 @@ def test_gaussians_count_one_standard_deviation_beyond_their_centers():
     assert gained == pytest.approx([0.1] * 3, abs=0.02)
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(0, 5), min_size=1, max_size=60), st.integers(1, 200))
 def test_representatives_are_as_many_as_each_point_weighs(weights, most):
     weights = np.array(weights)

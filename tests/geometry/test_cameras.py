@@ -37,6 +37,7 @@ def test_position_and_forward_agree_with_the_inverse_of_the_pose(position, offse
     assert camera.forward == pytest.approx(pose[:3, 2], abs=1e-9)
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(unit, unit, st.floats(-3, 3)), min_size=1, max_size=5))
 def test_points_are_projected_as_by_hand_and_those_behind_are_in_no_image(offsets):
     camera = look_at([3, 1, 2], [0.5, 0, 0], [0, 0, 1], 64, 48, 0.9)

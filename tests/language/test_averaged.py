@@ -347,6 +347,7 @@ def test_uncertainties_mean_the_same_in_a_wide_and_in_a_narrow_cone() -> None:
         assert 0.5 < float(field.uncertainties[differ].mean()) < 0.7  # 1 - |F| is 0.29 to 0.07
 
 
+@pytest.mark.slow
 def test_weights_are_as_soft_for_few_codes_as_for_many_in_any_cone() -> None:
     """Directions that fill a sphere look alike at any size of its cells: only the spread tells how far is far."""
     inner = np.random.default_rng(0).normal(size=(3000, 3))
@@ -362,6 +363,7 @@ def test_weights_are_as_soft_for_few_codes_as_for_many_in_any_cone() -> None:
     assert 0.5 < min(largest) < 0.8
 
 
+@pytest.mark.slow
 def test_averages_are_bit_identical_on_any_number_of_threads() -> None:
     gaussians, camera = random_gaussians(20_000, 0, scale=0.02), front_camera(160, 120)
     maps = random_features({"a": camera}, dimensions=70)

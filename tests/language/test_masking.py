@@ -72,6 +72,7 @@ def test_masked_pixels_have_the_mean_color_of_the_others():
     assert not whole(FilledRows(ArrayRows(image), np.zeros((6, 8), bool))).any()
 
 
+@pytest.mark.slow
 def test_features_codebook_and_codes_do_not_depend_on_masked_pixels(tmp_path):
     config = FeatureConfig(
         crop_sizes=(0.25,), crop_strides=(0.5,), map_cells=24, dino_short_side=48, dino_stride=4
@@ -167,6 +168,7 @@ def halves(tiny_capture, tmp_path_factory):
     return scenes
 
 
+@pytest.mark.slow
 def test_geometry_does_not_depend_on_masked_pixels(halves):
     points = initial_points(halves["plain"])
     config = ReconstructionConfig(

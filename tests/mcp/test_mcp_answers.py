@@ -35,6 +35,7 @@ def server(tmp_path_factory) -> MCPServer:
     return make_server(open_scenes(["demo"]), tmp_path_factory.mktemp("output"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tool", CALLS)
 def test_every_answer_has_the_frame_the_unit_the_threshold_the_presence_and_the_best_view(server, tool):
     reply, _ = ask(server, tool, **CALLS[tool])
@@ -97,6 +98,7 @@ def edited_table(tmp_path) -> Path:
     return scene
 
 
+@pytest.mark.slow
 def test_every_answer_says_that_a_step_of_an_edit_is_not_in_the_scene(edited_table, tmp_path):
     server = make_server(open_scenes([str(edited_table)]), tmp_path / "output")
     told = f"Note: 1 step of lexsplat edit is not in this scene; lexsplat edit {edited_table} save --output SCENE2"

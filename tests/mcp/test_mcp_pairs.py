@@ -36,6 +36,7 @@ def names(document):
     return {document["first"]["name"], document["second"]["name"]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "second", "ends"),
     [
@@ -66,6 +67,7 @@ def test_a_thing_is_not_measured_against_itself_but_against_the_nearest_other(
     assert document["note"] in text
 
 
+@pytest.mark.slow
 def test_of_several_things_the_nearest_pair_is_measured_and_named(server, points_of_things):
     reply, text = ask(server, "measure", first="fruit", second="toy")
     document = reply.structured_content
@@ -89,6 +91,7 @@ def test_one_thing_alone_has_no_distance(server, pair):
     assert reply.structured_content["error"]["remedy"]
 
 
+@pytest.mark.slow
 def test_a_thing_is_nearest_to_another_of_the_kind_that_it_is_of(server, points_of_things):
     for target, to in (("apple", "fruit"), ("fruit", "apple"), ("fruit", "fruit")):
         reply, text = ask(server, "nearest", target=target, to=to)

@@ -88,6 +88,7 @@ def test_an_output_that_becomes_a_file_ends_in_one_structured_error(scenes, tmp_
     assert "report" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tool", ["export", "edit"])
 def test_a_call_that_the_client_cancels_writes_nothing(scenes, tmp_path, monkeypatch, tool):
     writes = {"export": (writing, "export_scene"), "edit": (Editor, "save")}[tool]

@@ -66,6 +66,7 @@ def place(thing):
     return thing["center"][:2]
 
 
+@pytest.mark.slow
 def test_the_tools_are_described_and_read_only(server):
     tools = talk(server, lambda client: client.list_tools()).tools
     assert {tool.name for tool in tools} == READING
@@ -167,6 +168,7 @@ def test_a_dialogue_of_more_than_twenty_questions_is_answered_rightly(server):
     assert not wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tool", "arguments"),
     [
@@ -190,6 +192,7 @@ def test_every_answer_reports_what_is_unsure_and_why(writer, tool, arguments):
     assert asked["understood"] in text or tool == "nearest"
 
 
+@pytest.mark.slow
 def test_an_edit_of_what_is_unsure_or_not_here_is_refused_and_one_of_a_corrected_word_reports_it(
     scenes, tmp_path
 ):
@@ -234,6 +237,7 @@ def test_a_count_of_nothing_says_that_it_is_not_here(server):
     assert ask(server, "count", phrase="unicorns")[1] == 'Not here: nothing fits "unicorn".'
 
 
+@pytest.mark.slow
 def test_heat_is_drawn_for_what_a_question_asks_and_for_what_a_relation_finds(server):
     reply, text = ask(
         server, "render", view="view_033", phrases=["where is the mug?", "mug", "what is on the cloth?"]

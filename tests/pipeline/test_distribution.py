@@ -69,6 +69,7 @@ def test_features_of_workers_are_those_of_one_process(visible, capture, tmp_path
     assert len(events) == 12, "nothing is missing any more"
 
 
+@pytest.mark.slow
 def test_a_broken_photo_is_reported_and_the_other_views_are_kept(capture, tmp_path):
     broken = capture.views["view_03.png"].image_path
     broken.write_bytes(broken.read_bytes()[:2000])

@@ -72,6 +72,7 @@ def test_encoders_may_be_on_a_gpu_beside_a_rasterizer_on_the_cpu(monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_a_family_of_encoders_in_model_folders_needs_its_loader_alone(tiny_capture, tmp_path, monkeypatch):
     folder = tmp_path / "toy"
     folder.mkdir()
@@ -105,6 +106,7 @@ def test_features_of_encoders_on_a_gpu_are_those_of_the_cpu(tiny_capture, tmp_pa
         assert (expected.clip * maps["cuda"][name].clip).sum(-1).min() > 0.999
 
 
+@pytest.mark.slow
 def test_the_time_of_the_features_is_told_once_if_no_check_has_told_it(
     tiny_capture, tmp_path, monkeypatch, caplog
 ):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+import pytest
+
 import lexsplat
 from lexsplat.pipeline.scene_progress import named_messages
 from lexsplat.scenes.formats.foreign import warn
@@ -20,6 +22,7 @@ def test_a_warning_about_a_file_of_another_program_begins_with_the_name_of_the_s
     ]
 
 
+@pytest.mark.slow
 def test_every_module_logs_where_messages_get_the_name_of_their_scene():
     """The filter of a logger sees nothing that is logged to the loggers below it."""
     for path in sorted(Path(lexsplat.__file__).parent.rglob("*.py")):

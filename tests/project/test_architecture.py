@@ -55,6 +55,7 @@ def test_the_top_folder_shows_the_fifteen_packages_the_data_and_the_front_door()
     assert len(ORDER) <= 15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", ORDER)
 def test_imports_point_only_to_packages_that_come_before(package):
     for path, nodes in modules(package).items():

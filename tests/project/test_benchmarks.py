@@ -33,6 +33,7 @@ def test_every_benchmark_has_help(script, monkeypatch, capsys):
     assert "usage:" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_gpu_benchmark_runs_on_a_cpu_and_records_its_conditions(monkeypatch, tmp_path, capsys):
     monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
     import gpu
@@ -94,6 +95,7 @@ def test_the_naive_ports_ssim_is_that_of_scikit_image_away_from_the_border(monke
     assert abs(float(naive.ssim(image, photo)) - expected[20:-20, 20:-20].mean()) < 1e-5
 
 
+@pytest.mark.slow
 def test_the_naive_port_learns(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
     from naive import NaiveTrainer
@@ -140,6 +142,7 @@ def test_trainings_in_slices_start_from_the_points_of_a_build(monkeypatch):
     assert np.array_equal(earlier(capture, 3).points, capture.points)
 
 
+@pytest.mark.slow
 def test_a_project_for_opensplat_holds_the_training_views_and_points(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
     import opensplat
@@ -162,6 +165,7 @@ def test_a_project_for_opensplat_holds_the_training_views_and_points(monkeypatch
         assert np.abs(found.load_image() - view.load_image()).max() <= 0.5 / 255 + 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the clock of another process as Linux has it")
 def test_steps_of_another_program_are_timed_and_its_failure_is_a_reason(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
@@ -224,6 +228,7 @@ def test_operations_of_an_encoder_are_those_of_its_matrix_products(monkeypatch):
     assert sum(product.operations for product in products.counts) == 2 * (8 * 48 * 8 + 16 * 4 * 5)
 
 
+@pytest.mark.slow
 def test_encoders_are_measured_with_the_settings_and_in_the_precision_of_a_build(monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
     import features

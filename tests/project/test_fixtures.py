@@ -4,6 +4,8 @@ import ast
 from collections import defaultdict
 from pathlib import Path
 
+import pytest
+
 TESTS = Path(__file__).resolve().parents[1]
 
 
@@ -28,6 +30,7 @@ def ambiguous(found: dict[str, dict[str, str | None]]) -> dict[str, dict[str, st
     }
 
 
+@pytest.mark.slow
 def test_fixtures_of_one_name_give_one_annotated_type():
     sources = {str(path.relative_to(TESTS)): path.read_text() for path in TESTS.rglob("*.py")}
     found = types_of_fixtures(sources)

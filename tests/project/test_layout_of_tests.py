@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+import pytest
+
 TESTS = Path(__file__).parents[1]
 PACKAGES = {path.name for path in (TESTS.parent / "src" / "lexsplat").iterdir() if path.is_dir()}
 OTHERS = {"data", "hostile", "project", "support"}
@@ -26,6 +28,7 @@ def imported_tests(source: str) -> list[str]:
     return [name for name in imported_modules(source) if TEST_MODULES & set(name.split("."))]
 
 
+@pytest.mark.slow
 def test_no_module_of_the_tests_imports_a_test_module():
     for path in sorted(TESTS.rglob("*.py")):
         assert imported_tests(path.read_text(encoding="utf-8")) == [], path

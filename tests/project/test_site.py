@@ -14,6 +14,7 @@ def site():
     return runpy.run_path(str(TOOL))
 
 
+@pytest.mark.slow
 def test_every_page_is_written_and_every_link_within_the_site_leads_to_a_file(site, tmp_path):
     site["Site"](tmp_path).write()
     for name in site["PAGES"]:
@@ -40,6 +41,7 @@ def test_a_link_that_leads_nowhere_is_an_error(site, tmp_path, link):
         site["Site"](tmp_path / "site").write()
 
 
+@pytest.mark.slow
 def test_a_site_that_cannot_be_finished_leaves_the_earlier_one_as_it_was(site, tmp_path, monkeypatch):
     def fail(*arguments):
         raise RuntimeError("disk full")

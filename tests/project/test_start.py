@@ -125,6 +125,7 @@ def surplus(tmp_path_factory) -> Callable[..., set[str]]:
     return of
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in HELP_PAGES])
 def test_help_pages_without_settings_load_no_library_of_the_work(surplus, name):
     assert surplus(name, "--help") == set()

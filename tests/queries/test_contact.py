@@ -159,6 +159,7 @@ def test_what_rests_on_something_or_is_beside_it_is_not_under_it(things, first, 
     assert not holds("under", things[first], things[second], FRAME)
 
 
+@pytest.mark.slow
 def test_on_and_under_exclude_each_other_both_ways(things):
     pairs = list(itertools.permutations(things, 2))
     on, under = (

@@ -123,6 +123,7 @@ def test_somebody_who_looks_straight_down_has_the_top_of_the_picture_ahead():
     assert frame.right == pytest.approx([1, 0, 0], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_what_is_next_to_something_has_it_next_to_itself(select):
     frame = frame_of(FRONT, UP)
     for first, second in itertools.combinations(map(select, THINGS), 2):

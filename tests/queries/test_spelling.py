@@ -34,6 +34,7 @@ def test_an_everyday_word_is_known_without_the_dictionary_and_others_are_looked_
     assert "shoe" in everyday_words()
 
 
+@pytest.mark.slow
 def test_the_kept_dictionary_answers_as_simplemma_does():
     entries = [word.lower() for word in DefaultDictionaryFactory().get_dictionary("en") if word.isalpha()]
     some = [entries[0], entries[-1], *random.Random(0).sample(entries, 2_000)]
@@ -43,6 +44,7 @@ def test_the_kept_dictionary_answers_as_simplemma_does():
     assert [w for w in plurals if dictionary.lemma(w) != simplemma.lemmatize(w, lang="en")] == []
 
 
+@pytest.mark.slow
 def test_the_dictionary_is_read_once_and_then_found_in_the_cache(no_words_yet, monkeypatch):
     assert dictionary.is_english("ibex")
     assert [file.name for file in no_words_yet.iterdir()] == [f"english-{simplemma.__version__}.tsv"]
@@ -52,6 +54,7 @@ def test_the_dictionary_is_read_once_and_then_found_in_the_cache(no_words_yet, m
     assert (dictionary.lemma("apples"), dictionary.is_english("applle")) == ("apple", False)
 
 
+@pytest.mark.slow
 def test_a_kept_dictionary_that_was_cut_off_is_made_again(no_words_yet):
     assert dictionary.is_english("ibex")
     (kept,) = no_words_yet.iterdir()
@@ -63,6 +66,7 @@ def test_a_kept_dictionary_that_was_cut_off_is_made_again(no_words_yet):
     assert kept.read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_words_are_known_where_nothing_can_be_written(no_words_yet, monkeypatch):
     def refused(path, content):
         raise PermissionError(path)
@@ -72,6 +76,7 @@ def test_words_are_known_where_nothing_can_be_written(no_words_yet, monkeypatch)
     assert not no_words_yet.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plural", "one"),
     [("loaves", "loaf"), ("loaves of bread", "loaf of bread"), ("calves", "calf"), ("thieves", "thief"),

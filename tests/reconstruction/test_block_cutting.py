@@ -205,6 +205,7 @@ def rolled(capture, folder):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "message"),
     [

@@ -225,6 +225,7 @@ def test_a_run_that_was_killed_goes_on_after_the_last_finished_visit_with_the_sa
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
 def test_density_control_adds_gaussians_and_keeps_the_cap(strategy, capture, points, tmp_path):
     config = dataclasses.replace(
@@ -279,6 +280,7 @@ def test_blocks_on_ray_have_the_bits_of_one_process(capture, points, tmp_path, m
     assert all(torch.equal(a, b) for a, b in zip(here.tensors().values(), there.tensors().values()))
 
 
+@pytest.mark.slow
 def test_blocks_of_workers_that_do_not_see_the_scene_folder_have_the_bits_of_one_process(
     capture, points, tmp_path
 ):

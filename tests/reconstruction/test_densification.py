@@ -94,6 +94,7 @@ def test_default_control_equals_gsplats_strategy_up_to_its_missing_reset():
         assert_same(our_optimizers[name].state[ours[name]], optimizers[name].state[reference[name]])
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(st.integers(40, 120), st.sampled_from(["default", "mcmc"]), st.integers(0, 50))
 def test_the_cap_is_never_exceeded(cap, strategy, seed):

@@ -30,6 +30,7 @@ def torchmetrics_ssim(image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
     return functional.structural_similarity_index_measure(*planes, data_range=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("height", "width"), [(6, 6), (7, 40), (40, 7), (33, 61), (64, 64)])
 def test_ssim_equals_torchmetrics(height, width):
     image, photo = two_images(height, width)

@@ -53,6 +53,7 @@ def test_the_result_is_detached_and_records_the_mip_filter(trained):
     assert not any(tensor.requires_grad for tensor in gaussians.tensors().values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [{}, {"strategy": "mcmc"}, {"exposure": True}])
 def test_a_resumed_training_equals_an_uninterrupted_one_bit_for_bit(capture, points, change):
     config = dataclasses.replace(SHORT, **change)
@@ -112,6 +113,7 @@ def test_every_view_is_visited_once_per_round(capture, points):
     assert (rounds[0] != rounds[1]).any()
 
 
+@pytest.mark.slow
 def test_events_count_up_to_the_end(capture):
     events = []
     reconstruct(
@@ -134,6 +136,7 @@ def test_a_memory_budget_of_zero_does_not_change_results(capture, points):
     assert torch.equal(*results)
 
 
+@pytest.mark.slow
 def test_masked_pixels_do_not_affect_the_result(tiny_capture, tmp_path, points):
     captures = []
     for name, paint in (("plain", False), ("painted", True)):
@@ -158,6 +161,7 @@ def test_masked_pixels_do_not_affect_the_result(tiny_capture, tmp_path, points):
     assert torch.equal(*colors)
 
 
+@pytest.mark.slow
 def test_the_exposure_model_fits_a_darker_photo(capture, points, tiny_capture, tmp_path):
     folder = shutil.copytree(tiny_capture, tmp_path / "dark")
     dark = capture.train_names[2]

@@ -135,6 +135,7 @@ def test_the_gsplat_backend_renders_zero_gaussians_as_an_empty_image(on_gsplat):
     assert back_project(nothing, camera, torch.zeros(HEIGHT, WIDTH, 3)).shape == (0, 3)
 
 
+@pytest.mark.slow
 def test_the_gsplat_backend_renders_any_number_of_channels(on_gsplat):
     on_gsplat()
     gaussians, camera = random_gaussians(COUNT, 3), front_camera(WIDTH, HEIGHT)

@@ -179,6 +179,7 @@ def test_states_are_saved_no_more_often_than_requested(tmp_path):
     assert not eager.path.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["features", "reconstruct"])
 def test_one_ctrl_c_stops_a_build_in_any_stage(tiny_capture, tmp_path, stage):
     config = BuildConfig(

@@ -30,6 +30,7 @@ def trust_outside(hole):
     return (~hole).astype(float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edge", [np.inf, 4.0])
 def test_checkers_go_on_in_a_hole_and_end_where_they_ended_around_it(edge):
     original, (hole, _) = checkers(edge), disk()

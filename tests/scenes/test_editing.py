@@ -139,6 +139,7 @@ def test_the_shading_of_a_thing_in_a_pure_color_is_darker_and_not_flat(base, col
     assert float(found.max()) <= 1 + 1e-5
 
 
+@pytest.mark.slow
 @given(st.lists(st.sampled_from(["delete", "recolor", "move", "duplicate", "undo", "redo"]), max_size=9))
 @settings(max_examples=25)
 def test_replaying_a_journal_gives_the_same_scene(base, tmp_path_factory, actions):
@@ -273,6 +274,7 @@ def test_a_step_survives_json(base):
     assert (back.kind, back.values, back.phrase) == (step.kind, step.values, step.phrase)
 
 
+@pytest.mark.slow
 def test_a_saved_edit_is_a_scene(base, tmp_path):
     scene, labels = base
     folder = SceneFolder(tmp_path / "scene")

@@ -402,6 +402,7 @@ def picture(width: int, height: int) -> bytes:
     return content.getvalue()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "words"),
     [

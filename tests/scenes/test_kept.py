@@ -68,6 +68,7 @@ def test_what_is_kept_is_what_is_computed_without_it(demo_copy, demo):
     assert again.select("mug").view_shares == demo.select("mug").view_shares
 
 
+@pytest.mark.slow
 def test_the_bundled_scene_ships_its_objects_as_they_are_found_without_the_file(demo_copy, demo):
     assert demo.kept is not None, (
         "run tools/demo_scene/ship.py, or lexsplat.scenes.kept.keep on the bundled scene"

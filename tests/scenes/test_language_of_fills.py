@@ -66,6 +66,7 @@ def without_ball() -> Editor:
     return editor
 
 
+@pytest.mark.slow
 def test_a_fill_is_a_part_of_what_it_continues_by_place_and_color(without_ball):
     segments, gaussians = without_ball.scene.field.segments, without_ball.scene.gaussians
     fill = segments.added

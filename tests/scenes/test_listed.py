@@ -97,6 +97,7 @@ def test_a_color_of_another_name_of_a_thing_is_that_of_its_pixels(demo, phrase, 
     assert torch.equal(found.mask, listed(demo, name).mask)
 
 
+@pytest.mark.slow
 def test_a_recolored_thing_is_found_in_its_color_by_its_other_names(demo):
     editor = Editor(demo)
     editor.recolor(demo.select("mug"), "red")

@@ -45,6 +45,7 @@ def test_an_old_folder_answers(method, tmp_path):
     assert scene.relevancy("red apple", next(iter(scene.views))).shape[0] == 1
 
 
+@pytest.mark.slow
 def test_an_old_folder_says_how_to_get_segments(tmp_path, capsys):
     folder = str(shutil.copytree(OLD / "averaged", tmp_path / "scene"))
     assert cli.main(["info", folder]) == 0

@@ -74,6 +74,7 @@ def test_nan_is_not_written(tmp_path):
         write_ply(gaussians, tmp_path / "g.ply")
 
 
+@pytest.mark.slow
 def test_every_truncation_is_refused(tmp_path):
     write_ply(make(2, 0), tmp_path / "g.ply")
     data = (tmp_path / "g.ply").read_bytes()
@@ -91,6 +92,7 @@ def test_an_absurd_count_is_refused_without_allocating(tmp_path):
         read_ply(tmp_path / "t.ply")
 
 
+@pytest.mark.slow
 @settings(max_examples=200)
 @given(data=st.data())
 def test_flipped_bytes_cause_only_typed_errors(tmp_path_factory, data):

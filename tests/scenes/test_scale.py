@@ -78,6 +78,7 @@ def test_a_distance_can_be_given_between_two_phrases(old_demo_copy, capsys):
     assert stored(old_demo_copy)["meters_per_unit"] == pytest.approx(0.08 / found[0].size[2])
 
 
+@pytest.mark.slow
 def test_what_is_not_found_and_what_has_no_length_are_refused_with_a_remedy(old_demo_copy, capsys):
     scale = ["scale", str(old_demo_copy), "--distance", "1m"]
     fails_in_one_line(capsys, [*scale, "--height-of", "violin"], "violin: ", "found nothing; try other words")
@@ -99,6 +100,7 @@ def test_up_can_be_set_and_is_used_everywhere(old_demo_copy, capsys):
     assert turned == pytest.approx([0, 1, 0], abs=1e-6), "glTF has y up"
 
 
+@pytest.mark.slow
 def test_a_rebuild_keeps_up_and_scale_while_the_cameras_are_unchanged(tiny_capture, tmp_path, caplog):
     build = ["reconstruct", tiny_capture, "--output", tmp_path, "--device", "cpu", "--iterations", 3]
     assert run(*build) == 0

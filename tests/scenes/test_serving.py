@@ -160,6 +160,7 @@ def test_words_that_the_bundled_encoder_does_not_know_are_named_and_nothing_is_c
     assert answer["note"] in answer["sentence"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", ["x" * 100_000, "where is the " * 7000])
 def test_a_text_that_is_too_long_is_asked_as_one_thing_and_says_so(served_demo, line):
     answer = answer_line(served_demo, line)
@@ -194,6 +195,7 @@ def test_a_query_of_words_that_the_encoder_does_not_know_is_unsure_at_most_as_in
     assert (unknown["present"], mug["present"], mug["note"]) == ("unsure", "yes", "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prompt", ["xxxxxxx", "the third teddy bear", "mug", "is there a bicycle?"])
 @pytest.mark.parametrize("first", ["find", "ask"])
 def test_a_prompt_has_one_presence_whatever_asks_it_and_in_any_order(served_demo, prompt, first):

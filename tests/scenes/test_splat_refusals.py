@@ -52,6 +52,7 @@ def test_spz_4_reports_where_its_table_cannot_begin(tmp_path):
     refused(tmp_path / "g.spz", content[:15] + bytes([5]) + content[16:], "5 streams instead of 6")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", [3, 4])
 def test_no_flipped_bit_in_the_data_of_an_spz_changes_what_is_read(tmp_path, version):
     path = tmp_path / "g.spz"

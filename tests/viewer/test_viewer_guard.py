@@ -99,6 +99,7 @@ def ask(port: int, body: bytes, **headers):
     return send(port, "POST", "/ask", body, **{"Content_Length": str(len(body)), **headers})
 
 
+@pytest.mark.slow
 def test_the_page_is_served_for_its_own_host_only_and_not_in_frames(viewer):
     own = f"127.0.0.1:{viewer.port}"
     page = send(viewer.port, Host=own)

@@ -58,6 +58,7 @@ def test_a_port_in_use_gives_the_next_one(viewer):
         second.stop()
 
 
+@pytest.mark.slow
 def test_stopping_frees_the_port():
     running = ViewerServer(ball_scene(per_ball=20)[0], ViewerConfig(port=0))
     port = running.port

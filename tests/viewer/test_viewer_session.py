@@ -93,6 +93,7 @@ def test_left_and_right_are_those_of_the_page_that_asks(session, scene_and_balls
     ]
 
 
+@pytest.mark.slow
 def test_a_click_names_and_selects_what_is_there(session, scene_and_balls):
     _, ground_truth = scene_and_balls
     asked = 0
