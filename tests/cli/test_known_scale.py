@@ -54,6 +54,7 @@ def test_positions_are_printed_in_meters_where_the_scale_is_known_and_in_scene_u
             assert set(re.findall(r"size [\d. x]+?( scene units| m),", out)) == {f" {unit}"}
 
 
+@pytest.mark.slow
 def test_json_has_centers_in_both_units(scaled, apple, capsys):
     found = json.loads(printed(capsys, "find", scaled, "red apple", "--json"))
     validated("find", found)

@@ -98,6 +98,7 @@ def test_an_object_of_a_scene_without_segments_is_found_by_its_word_and_the_list
     assert {"mug", "pumpkin", "teddy bear"} <= {thing["name"] for thing in document["objects"]}
 
 
+@pytest.mark.slow
 def test_a_table_is_alone_on_standard_output_and_the_rest_is_told_beside_it(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("lexsplat.scenes.objects.NO_SEGMENTS", "how to get them")
     old = Path(__file__).parents[1] / "data" / "scene_d4e65b3" / "averaged"

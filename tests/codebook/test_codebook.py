@@ -261,6 +261,7 @@ def test_kmeans_survives_fewer_features_than_codes() -> None:
     assert mean_cosine(book, features, None) == pytest.approx(1, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_held_out_views_take_no_part_in_the_fit() -> None:
     maps, _ = clustered_maps(4, views=4)
     log = ReadLog(maps)

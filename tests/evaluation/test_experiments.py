@@ -103,6 +103,7 @@ def test_every_file_is_written_after_every_run_and_both_commands_keep_their_own(
     validated("ablation", json.loads((bench.output / "ablation.json").read_text()))
 
 
+@pytest.mark.slow
 def test_crop_sizes_of_features_of_another_program_are_refused(open_bench, tmp_path):
     bench = open_bench()
     bench.config = replace(bench.config, features_from=tmp_path)

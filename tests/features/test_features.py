@@ -43,6 +43,7 @@ def capture(tmp_path) -> Capture:
     return make_capture(tmp_path / "images")
 
 
+@pytest.mark.slow
 def test_maps_equal_those_of_crops_encoded_one_by_one(capture, tmp_path):
     maps = extract_features(capture, ColorEncoder(), GridEncoder(), CONFIG, cache_dir=tmp_path / "cache")
     assert list(maps) == list(capture.views)

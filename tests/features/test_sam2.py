@@ -109,6 +109,7 @@ def test_masks_that_are_unsure_unstable_or_empty_are_left_out():
     assert (paint(as_logits(box(0, 0, 0, 0)), torch.ones(1)) == -1).all(), "a photo without masks"
 
 
+@pytest.mark.slow
 def test_a_model_of_another_kind_is_refused(clip_folder):
     with pytest.raises(ModelError) as caught:
         load_segmenter(str(clip_folder))

@@ -26,6 +26,7 @@ def test_look_at_spans_the_vertical_field_of_view():
     assert project(camera, np.array([0, 1.0, 1.0]))[1] == pytest.approx(48)  # 45 degrees down: the lower edge
 
 
+@pytest.mark.slow
 @given(st.tuples(unit, unit, unit), st.tuples(unit, unit, unit))
 def test_position_and_forward_agree_with_the_inverse_of_the_pose(position, offset):
     position = np.array(position)

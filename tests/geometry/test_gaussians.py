@@ -14,6 +14,7 @@ def some_points(count: int = 50, seed: int = 0) -> tuple[np.ndarray, np.ndarray]
     return rng.normal(size=(count, 3)).astype(np.float32), rng.uniform(size=(count, 3)).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_initial_scales_are_the_mean_distance_to_three_neighbors():
     from sklearn.neighbors import NearestNeighbors
 

@@ -51,6 +51,7 @@ def test_every_answer_has_the_frame_the_unit_the_threshold_the_presence_and_the_
     assert set(tools[tool].output_schema["required"]) >= FRAME
 
 
+@pytest.mark.slow
 def test_a_pixel_is_answered_with_the_place_of_the_thing(server):
     reply, text = ask(server, "what_is_at", **CALLS["what_is_at"])
     center = reply.structured_content["thing"]["center"]

@@ -146,6 +146,7 @@ def test_over_standard_input_and_output_wrong_calls_are_refused_in_the_same_line
         asyncio.run(_all_hostile(StdioServerParameters(command=program, args=words, env=dict(os.environ))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "phrase", ["x" * 100_000, "where is the " * 8000, "\x07\x1b[31m", "🍎", "красное яблоко"]
 )

@@ -123,6 +123,7 @@ def test_the_time_of_the_features_is_told_once_if_no_check_has_told_it(
         assert sum(told in message for message in caplog.messages) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "expected"), [(1.9, 0), (2.0, 1)])
 def test_a_forecast_of_less_than_two_seconds_is_left_out(
     clip_folder, tmp_path, monkeypatch, caplog, seconds, expected

@@ -63,6 +63,7 @@ def test_imports_point_only_to_packages_that_come_before(package):
             assert ORDER.index(other) < ORDER.index(package), f"{path} must not import {other}"
 
 
+@pytest.mark.slow
 @every_package
 def test_no_module_uses_pickle_eval_or_a_bare_except(package):
     for path, nodes in modules(package).items():

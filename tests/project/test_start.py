@@ -137,6 +137,7 @@ def test_help_pages_with_settings_load_what_the_settings_need(surplus, name):
     assert surplus(name, "--help") == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [w for w, libraries in ALLOWED.items() if libraries <= HELP], ids=" ".join)
 def test_the_overview_and_wrong_usage_load_no_library_of_the_work(surplus, words):
     assert surplus(*words) == set()

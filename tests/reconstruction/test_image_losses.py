@@ -52,6 +52,7 @@ def test_the_moments_of_a_photo_are_those_of_a_gaussian_window_in_float64(height
     np.testing.assert_allclose(target.variance, variance, rtol=1e-6, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 1.0, 1.1])
 @pytest.mark.parametrize("noise", [1e-3, 1e-2, 0.1])
 def test_ssim_is_exact_on_bright_flat_and_gray_surfaces(level, noise):

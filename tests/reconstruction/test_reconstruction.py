@@ -43,6 +43,7 @@ def test_held_out_views_become_sharp(capture, trained):
     assert held_out_psnr(trainer, capture) > max(18.0, before + 6.0)
 
 
+@pytest.mark.slow
 def test_density_control_adds_gaussians_within_the_cap(points, trained):
     assert len(points.points) < len(trained[0].gaussians()) <= 2_000
 
@@ -87,6 +88,7 @@ def test_state_survives_safetensors(capture, points, tmp_path):
     assert trainer.step() == other.step()
 
 
+@pytest.mark.slow
 def test_results_depend_on_the_seed_but_not_on_the_global_generator_or_threads(capture, points):
     def means(seed: int, outside: int) -> torch.Tensor:
         threads = torch.get_num_threads()
@@ -126,6 +128,7 @@ def test_events_count_up_to_the_end(capture):
     assert all(5 < event.metrics["psnr"] < 50 for event in events[1:])
 
 
+@pytest.mark.slow
 def test_a_memory_budget_of_zero_does_not_change_results(capture, points):
     results = []
     for memory in (0, 4 << 30):

@@ -66,6 +66,7 @@ def test_the_earlier_name_of_the_bundled_encoder_means_it_everywhere():
     assert BuildConfig(clip="embedded", dino="embedded").clip == "bundled"
 
 
+@pytest.mark.slow
 def test_an_encoder_that_is_given_is_checked_when_the_scene_is_opened_wherever_it_lies(tmp_path):
     moved = shutil.copytree(BUNDLED_ENCODERS / "clip", tmp_path / "moved")
     assert open_scene("demo", clip=str(moved)).ask("red apple").presences == ("yes",)

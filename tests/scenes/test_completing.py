@@ -42,6 +42,7 @@ def test_checkers_go_on_in_a_hole_and_end_where_they_ended_around_it(edge):
     )
 
 
+@pytest.mark.slow
 def test_a_shadow_and_remains_around_the_hole_do_not_spoil_the_pattern():
     original, (hole, away) = checkers(), disk()
     random = np.random.default_rng(0)

@@ -78,6 +78,7 @@ def test_a_fill_is_a_part_of_what_it_continues_by_place_and_color(without_ball):
     assert float(agree[clear].float().mean()) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extend", [whole_things, with_remains])
 def test_an_edit_takes_a_fill_with_its_own_surface_and_no_other(without_ball, extend):
     scene = without_ball.scene

@@ -113,6 +113,7 @@ def test_the_page_is_served_for_its_own_host_only_and_not_in_frames(viewer):
     assert send(viewer.port, Host=own, Origin="http://evil.example").status == 403
 
 
+@pytest.mark.slow
 def test_only_the_viewers_own_page_may_ask(viewer):
     own = f"127.0.0.1:{viewer.port}"
     body = json.dumps({"prompt": "ball 1", "version": 1}).encode()
@@ -158,6 +159,7 @@ def test_the_server_upgrades_no_connection(viewer):
     assert send(viewer.port, Host=own, Origin=f"http://{own}", **asked).status != 101
 
 
+@pytest.mark.slow
 def test_elsewhere_than_on_loopback_a_visitor_needs_the_token_of_the_printed_address(monkeypatch):
     monkeypatch.setattr(serving, "_is_loopback", lambda _: False)
     running = ViewerServer(ball_scene(per_ball=20)[0], ViewerConfig(port=0))

@@ -28,6 +28,7 @@ def get(port: int, path: str) -> tuple[int, bytes]:
     return response.status, content
 
 
+@pytest.mark.slow
 def test_it_listens_on_loopback_by_default(viewer):
     assert ViewerConfig().host == "127.0.0.1"
     assert viewer.url == f"http://127.0.0.1:{viewer.port}"
