@@ -48,7 +48,7 @@ def server(scenes) -> MCPServer:
 
 
 @pytest.fixture(scope="module")
-def writer(scenes, tmp_path_factory) -> tuple[MCPServer, Path]:
+def writing_server(scenes, tmp_path_factory) -> tuple[MCPServer, Path]:
     """A server that writes, and its folder."""
     folder = tmp_path_factory.mktemp("writer")
     return make_server(scenes, folder), folder
@@ -181,8 +181,8 @@ def test_a_dialogue_of_more_than_twenty_questions_is_answered_rightly(server):
         ("edit", {"action": "keep", "phrase": "🍎", "folder": "apple", "confirm": True}),
     ],
 )
-def test_every_answer_reports_what_is_unsure_and_why(writer, tool, arguments):
-    reply, text = ask(writer[0], tool, **arguments)
+def test_every_answer_reports_what_is_unsure_and_why(writing_server, tool, arguments):
+    reply, text = ask(writing_server[0], tool, **arguments)
     asked = reply.structured_content["look_at"] if tool == "render" else reply.structured_content
     assert asked["present"] == "unsure"
     assert '"🍎"' in asked["understood"]
@@ -209,8 +209,8 @@ def test_an_edit_of_what_is_unsure_or_not_here_is_refused_and_one_of_a_corrected
 
 
 @pytest.mark.parametrize("color", [[], [1, 0], [1e308, 0, 1], [-1, 0, 0]])
-def test_a_color_that_is_none_is_refused_with_what_was_expected(writer, color):
-    server, folder = writer
+def test_a_color_that_is_none_is_refused_with_what_was_expected(writing_server, color):
+    server, folder = writing_server
     reply, text = ask(server, "edit", action="recolor", phrase="mug", folder="new", color=color)
     assert reply.is_error
     assert reply.structured_content["error"]["subject"] == "color"
