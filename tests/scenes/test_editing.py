@@ -24,7 +24,6 @@ from lexsplat.scenes.recoloring import recolored
 from lexsplat.scenes.scene import Scene, open_scene
 from lexsplat.scenes.views import PhotoLens, StoredView
 
-
 TABLE = (0.12, 3.2, 4.4)
 """Its sides, as `tools/demo_scene/surroundings.py` makes it."""
 
