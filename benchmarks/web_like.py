@@ -167,7 +167,7 @@ def make_web_like(
         seed: Of rotation, private directions and offsets.
         facts: What to imitate.
         private: Number of private dimensions of each tower.
-        each: Crops of each of two sizes in a photo, from which it is made; twice as many are varied.
+        each: Crops of each of two sizes in a photo; variations have twice as many.
     """
     bundled = load_clip("bundled")
     if not isinstance(bundled, ClipEncoder):

@@ -114,6 +114,12 @@ def test_a_narrowed_view_has_the_weights_and_pixels_of_a_view_without_what_is_go
         pixels = render(gaussians, camera, prepared=replace(whole, pairs=whole.pairs.narrowed(tile))).image
         assert torch.equal(pixels[y, x], render(gaussians, camera).image[y, x])
         assert not pixels[0, 0].any()
+        values = torch.zeros(HEIGHT, WIDTH, 2)
+        values[y, x] = torch.tensor([1.0, -2.0])
+        narrowed = replace(whole, pairs=whole.pairs.narrowed(tile))
+        assert torch.equal(
+            back_project(gaussians, camera, values, narrowed), back_project(gaussians, camera, values)
+        )
 
 
 def test_a_view_of_nothing_adds_nothing():

@@ -208,7 +208,7 @@ def test_a_kept_answer_depends_on_what_was_understood_and_the_view_and_the_thres
 @pytest.mark.slow
 def test_a_saved_edit_keeps_what_its_views_show(demo_copy, tmp_path):
     editor = Editor(open_scene(demo_copy, device="cpu"))
-    editor.delete(editor.scene.find("mug"), fill=False)
+    editor.delete(editor.scene.find("mug"))
     editor.save(tmp_path / "saved")
     saved = open_scene(tmp_path / "saved", device="cpu")
     assert saved.seen.complete

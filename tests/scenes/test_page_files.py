@@ -368,7 +368,7 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(
         (lambda m: m.update(language=None), "language or a server"),
         (
             lambda m: m["language"].update(segments="s", segment_rule=None),
-            "7 numbers in language.segment_rule",
+            "9 numbers in language.segment_rule",
         ),
         (
             lambda m: m["language"].update(
@@ -386,8 +386,10 @@ def test_a_damaged_file_and_a_browser_without_webgl_are_reported_in_one_line(
                 ),
                 m["words"]["rule"].update(parts=[1]),
             ),
-            "lists of names, qualities, colors, parts in words.rule",
+            "lists of names, qualities, colors, parts, gone in words.rule",
         ),
+        (lambda m: (m.update(text={}), m["words"].pop("rule")), "16 numbers in words.rule"),
+        (lambda m: (m.update(text={}), m["words"]["rule"].update(alike=[1])), "names of parts in words.rule"),
         (lambda m: m["selection_rule"].pop("link"), "11 numbers in selection_rule"),
         (lambda m: m.pop("grammar"), "an object in grammar"),
         (lambda m: m["files"].pop("scene.ply"), "scene.ply in files"),

@@ -263,12 +263,16 @@ const FIELDS: [string, string, (value: unknown) => boolean][] = [
   ["views", "a list of cameras", areViews],
 ];
 
-const SEGMENT_RULE = ["lowest", "border", "own_share", "steepness", "most_certain", "below", "threshold"];
+const SEGMENT_RULE = ["lowest", "border", "better", "enough", "own_share", "steepness", "most_certain", "below", "threshold"];
 const PART_RULE = [
   "held", "fewest", "neighbors", "color", "score", "rounds", "shared", "best", "lowest", "mostly", "all", "usual", "spread", "first",
   "last", "steps", "near", "few", "walked", "nearest", "short", "shorter", "firm", "outside",
 ];
-const WORD_LISTS = ["names", "qualities", "colors", "parts"];
+const EVERYDAY_RULE = [
+  "border", "steepness", "offset", "peak_share", "peak", "yes", "no", "yes_segment", "yes_colored", "no_segment", "yes_part",
+  "no_part", "at_thing", "border_part", "over_thing", "rival",
+];
+const WORD_LISTS = ["names", "qualities", "colors", "parts", "gone"];
 const SELECTION_RULE = [
   "threshold", "link", "smallest_share", "convincing", "peak_count", "faint", "same_surface", "least_surface",
   "evidence_share", "evidence_count", "evidence_faint",
@@ -295,7 +299,12 @@ function lacking(manifest: Manifest): string {
   if (manifest.language?.segments) {
     if (!isRule(manifest.language.segment_rule, SEGMENT_RULE)) return `${SEGMENT_RULE.length} numbers in language.segment_rule`;
     if (!isRule(manifest.language.part_rule, PART_RULE)) return `${PART_RULE.length} numbers in language.part_rule`;
+  }
+  if (manifest.text || manifest.language?.segments) {
+    const rule = manifest.words.rule;
+    if (!isRule(rule, EVERYDAY_RULE)) return `${EVERYDAY_RULE.length} numbers in words.rule`;
     if (!WORD_LISTS.every((name) => areTexts(at(`words.rule.${name}`)))) return `lists of ${WORD_LISTS.join(", ")} in words.rule`;
+    if (!isText(rule!.doubtful) || !Array.isArray(rule!.alike) || !rule!.alike.every(areTexts)) return "names of parts in words.rule";
   }
   if (!isRule(manifest.selection_rule, SELECTION_RULE)) return `${SELECTION_RULE.length} numbers in selection_rule`;
   return manifest.files[manifest.scene.file] ? "" : `${manifest.scene.file} in files`;

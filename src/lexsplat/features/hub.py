@@ -48,7 +48,7 @@ _OTHERS = {"segments": "superpixels, which need no model (`--features.segments s
 _HUB_TIMEOUT = 5.0  # seconds to wait for the hub's first response; without a network it fails at once
 
 KEPT_FROM = 1 << 26
-"""Bytes of a model from which its hash is kept; below, it takes a tenth of a second."""
+"""Bytes of a model from which the user's cache keeps its hash; below, it takes a tenth of a second."""
 _FRESH = 2.0
 """Seconds after a change in which another one might leave the time of the file as it is."""
 
@@ -173,8 +173,8 @@ def preprocessing_file(folder: Path) -> Path | None:
 def content_hash(folder: Path, tower: str) -> str:
     """Hash of the files on which a model's output depends (`loaded_files`). 32 hex digits.
 
-    The process keeps the hash under the place, size and time of change of the files. The user's cache keeps that of
-    large models so.
+    The process keeps the hash under the place, size and time of change of the files. The user's cache keeps hashes of
+    large models under the same facts.
     """
     files = loaded_files(folder, tower)
     state = _state(files)
@@ -183,7 +183,7 @@ def content_hash(folder: Path, tower: str) -> str:
     kept = _path_of_hash(state)
     with contextlib.suppress(OSError, UnicodeDecodeError):
         if kept is not None and re.fullmatch("[0-9a-f]{32}", known := kept.read_text()):
-            return known
+            return _hashes.setdefault(state, known)
     found = digest((part for path in files for part in chain([path.name.encode()], blocks(path))), 16)
     if state and state == _state(files):  # no file has changed meanwhile
         _hashes[state] = found

@@ -287,7 +287,7 @@ def pool(features: Tensor, labels: Tensor | Sequence[Tensor]) -> Tensor:
     """
     from scipy.sparse import csr_matrix
 
-    flat = features.reshape(-1, features.shape[-1])
+    flat = features.reshape(-1, features.shape[-1]).float()
     known = flat.any(-1)
     total, count = torch.zeros_like(flat), torch.zeros(len(flat), 1)
     for level in labels:

@@ -111,7 +111,7 @@ def _heights(codewords: Tensor, texts: Tensor, mean: Tensor) -> Tensor:
 
 
 def _quantile(values: Tensor, share: float) -> Tensor:
-    """``values.quantile(share, dim=0)`` of ``[K, P]``, bit for bit; on a CPU in a third of its time."""
+    """``values.quantile(share, dim=0)`` of finite ``[K, P]``, bit for bit; on a CPU in a third of its time."""
     if not values.is_cpu or values.requires_grad or not values.numel():
         return values.quantile(share, dim=0)
     rank = torch.tensor(share, dtype=values.dtype) * (len(values) - 1)

@@ -25,6 +25,8 @@ _REACH = 1.5
 _NEAREST = 4
 _TAIL = 0.02
 """Share of the Gaussians of a surface on each side that do not tell how thick it is."""
+_PRODUCT = 1 << 22
+"""Distances from sides of a hull that are held at once."""
 _ROUNDS = 4
 """How often pieces of a surface join those that joined before."""
 
@@ -98,7 +100,9 @@ def _within(gaussians: Gaussians, labels: IntArray, specks: IntArray, others: In
         own = np.flatnonzero(others == other)
         with contextlib.suppress(QhullError):  # nothing lies within few or flat points
             sides = ConvexHull(means[labels == other]).equations
-            found[own] = (middles[specks[own]] @ sides[:, :3].T + sides[:, 3] <= 0).all(1)
+            step = max(1, _PRODUCT // len(sides))
+            for some in (own[start : start + step] for start in range(0, len(own), step)):
+                found[some] = (middles[specks[some]] @ sides[:, :3].T + sides[:, 3] <= 0).all(1)
     return found
 
 

@@ -138,7 +138,12 @@ class _Blend(torch.autograd.Function):
         grad_image = _zeros(*alpha.shape, channels) if grad_image is None else grad_image
         grad_alpha = _zeros(*alpha.shape) if grad_alpha is None else grad_alpha
         values = _gather(pairs, colors, features)
-        rows = np.empty(len(pairs.members) * gradients.row_width(channels), np.float32)
+        listed = int(
+            pairs.pair_offsets[-1]
+        )  # more than are drawn in a narrowed view, whose other rows stay 0
+        rows = (np.empty if listed == len(pairs.members) else np.zeros)(
+            listed * gradients.row_width(channels), np.float32
+        )
         parallel(
             gradients.blend_backward, pairs.tiles, TILE_GRAIN,
             pairs.ellipses, pairs.tile_offsets, pairs.members, pairs.pairs, pairs.rows, values,

@@ -29,10 +29,11 @@ class TilePairs:
         count: Number of all Gaussians N.
         order: Index of each visible Gaussian, nearest first ``[V]``.
         ellipses: Center, half conic and opacity in that order ``[V, 8]``.
-        pair_offsets: First pair of each Gaussian in the list by Gaussian ``[V + 1]``.
+        pair_offsets: First pair of each Gaussian in the list by Gaussian ``[V + 1]``. The last entry is M, or more
+            in a `narrowed` view, whose pairs keep their places in that list.
         tile_offsets: First pair of each tile in the list by tile ``[T + 1]``.
         members: Position in ``order`` of each pair, by tile and depth ``[M]``.
-        pairs: Place of each pair in the list by Gaussian ``[M]``, which `narrowed` does not shorten.
+        pairs: Place of each pair in the list by Gaussian ``[M]``.
         rows: First row of the tile that the Gaussian reaches, and one past the last ``[M, 2]``.
     """
 

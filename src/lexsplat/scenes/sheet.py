@@ -39,7 +39,8 @@ def write_sheet(scene: Scene, things: Sequence[Selection], path: Path) -> None:
     draw = ImageDraw.Draw(sheet)
     for number, thing in enumerate(things):
         left, top = number % columns * width, number // columns * height
-        sheet.paste(_thumbnail(scene, thing), (left, top))
+        tile = _thumbnail(scene, thing)
+        sheet.paste(tile, (left + (_TILE[0] - tile.width) // 2, top + (_TILE[1] - tile.height) // 2))
         label = f"{number + 1}. {thing.phrase}".encode("latin-1", "replace").decode("latin-1")[:36]
         draw.text((left + 4, top + _TILE[1] + 3), label, fill="white")  # the built-in font has latin-1 alone
     with atomic_path(path) as temporary:
@@ -60,17 +61,16 @@ def _thumbnail(scene: Scene, thing: Selection) -> Image.Image:
 
 
 def _around(camera: Camera, pixels: np.ndarray) -> Camera:
-    """The part of a view around some pixels ``[P, 2]``, as large as a tile; it does not leave the picture."""
+    """The part of a view around some pixels ``[P, 2]``, of a tile's size; smaller where the picture ends before."""
     low, high = pixels.min(0), pixels.max(0)
     tile, whole = np.array(_TILE, float), np.array([camera.width, camera.height], float)
     wanted = ((1 + 2 * _MARGIN) * (high - low) / tile).max()  # pixels of the photo for one of the tile
-    scale = min(max(wanted, 1 / _CLOSEST), (whole / tile).max())
-    first = (low + high) / 2 - scale * tile / 2
-    room = whole - scale * tile
-    first = np.where(room > 0, np.clip(first, 0, np.maximum(room, 0)), room / 2)
+    scale = max(min(wanted, (whole / tile).max()), 1 / _CLOSEST)
+    size = np.clip(whole / scale, 1, tile).astype(int)
+    first = np.clip((low + high) / 2 - scale * size / 2, 0, np.maximum(whole - scale * size, 0))
     K = (
         np.diag([1 / scale, 1 / scale, 1.0])
         @ np.array([[1, 0, -first[0]], [0, 1, -first[1]], [0, 0, 1]])
         @ camera.K
     )
-    return Camera(*_TILE, K, camera.viewmat)
+    return Camera(int(size[0]), int(size[1]), K, camera.viewmat)

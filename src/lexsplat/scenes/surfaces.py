@@ -151,12 +151,11 @@ class Views:
         return replace(view, pairs=view.pairs.narrowed(view.pairs.tiles_at(pixels)))
 
     def weights(self, places: NDArray[np.int64], gone: Mask) -> tuple[FloatArray, FloatArray]:
-        """Visible weights of some Gaussians ``[P]``, in pixels: now, and where others ``[N]`` are gone."""
+        """Visible weights of some Gaussians ``[P]``, in pixels: now, and without others ``[N]``."""
         now, then = np.zeros(len(places)), np.zeros(len(places))
         asked = np.zeros(len(gone), bool)
         asked[places] = True
-        drawn = self.gaussians.select(torch.from_numpy(~gone).to(self.gaussians.device))
-        among = (np.cumsum(~gone) - 1)[places]
+        others: Gaussians | None = None
         for number, camera in enumerate(self.small):
             view = self.prepared(number)
             if isinstance(view.pairs, TilePairs):
@@ -167,8 +166,9 @@ class Views:
                 now += _measured(self.gaussians, camera, with_it)[places]
                 then += _measured(self.gaussians, camera, without)[places]
             else:
+                others = others or self.gaussians.select(torch.from_numpy(~gone).to(self.gaussians.device))
                 now += _measured(self.gaussians, camera, view)[places]
-                then += _measured(drawn, camera, None)[among]
+                then += _measured(others, camera, None)[(np.cumsum(~gone) - 1)[places]]
         return now, then
 
 

@@ -1,4 +1,4 @@
-"""The rules of `lexsplat.queries` for the page, whose twin of them is ``web/src/rules.ts``: constants and words."""
+"""Constants and lists of words by which the page answers as `lexsplat.queries` does."""
 
 from __future__ import annotations
 
