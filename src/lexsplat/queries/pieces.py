@@ -7,14 +7,13 @@ clusters, S their Gaussians.
 
 from __future__ import annotations
 
-import contextlib
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import cKDTree
 
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.hulls import inside_hull
 from lexsplat.geometry.rotations import covariances
 
 _SMALLEST, _LARGEST = 0.05, 0.2
@@ -25,8 +24,6 @@ _REACH = 1.5
 _NEAREST = 4
 _TAIL = 0.02
 """Share of the Gaussians of a surface on each side that do not tell how thick it is."""
-_PRODUCT = 1 << 22
-"""Distances from sides of a hull that are held at once."""
 _ROUNDS = 4
 """How often pieces of a surface join those that joined before."""
 
@@ -44,7 +41,8 @@ def with_pieces(
         labels: The cluster of each ``[M]``, numbered from 0.
         opacities: Their opacities ``[M]``.
         surface: Whether they are those of a surface, such as a table. The things on it divide what can be seen of it:
-            the smallest pieces count as well, and so do those that reach another piece.
+            the smallest pieces count in its plane, and pieces may reach another piece. In other things the smallest
+            count within the convex hull.
 
     Returns:
         The cluster of each ``[M]``, numbered from 0.
@@ -98,11 +96,7 @@ def _within(gaussians: Gaussians, labels: IntArray, specks: IntArray, others: In
     middles = np.stack([np.bincount(labels, axis) for axis in means.T], 1) / np.bincount(labels)[:, None]
     for other in np.unique(others):
         own = np.flatnonzero(others == other)
-        with contextlib.suppress(QhullError):  # nothing lies within few or flat points
-            sides = ConvexHull(means[labels == other]).equations
-            step = max(1, _PRODUCT // len(sides))
-            for some in (own[start : start + step] for start in range(0, len(own), step)):
-                found[some] = (middles[specks[some]] @ sides[:, :3].T + sides[:, 3] <= 0).all(1)
+        found[own] = inside_hull(means[labels == other], middles[specks[own]])
     return found
 
 

@@ -13,11 +13,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.geometry.hulls import GROWN, inside_hull
 from lexsplat.language.segments import Segments
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.sampling import evenly
@@ -26,8 +27,6 @@ _HIDDEN = 0.05
 """Gaussians of which the views show a smaller share are hidden. Chosen on the second scene among 0.005 to 0.1."""
 _MOSTLY = 0.5
 _NEIGHBORS, _BESIDE = 6, 2
-_GROWN = 1.05
-"""Factor by which the convex hull of a thing is enlarged."""
 _VIEWS = 64
 _ROWS = 1 << 14
 """Gaussians that are projected at a time: their arrays stay in the cache of a core."""
@@ -148,18 +147,6 @@ def inside_hulls(chosen: Selection, among: Tensor) -> Tensor:
     means, found = chosen.gaussians.means.detach().cpu().double().numpy(), among.cpu().numpy().copy()
     places, inside = means[found], np.zeros(int(found.sum()), bool)
     for each in chosen.instances:
-        inside |= inside_hull(means[each.mask.cpu().numpy()], places)
+        inside |= inside_hull(means[each.mask.cpu().numpy()], places, GROWN)
     found[found] = inside
     return torch.from_numpy(found).to(among.device)
-
-
-def inside_hull(
-    points: NDArray[np.float64], places: NDArray[np.float64], grown: float = _GROWN
-) -> NDArray[np.bool_]:
-    """Which places ``[M, 3]`` lie in the convex hull of points ``[K, 3]``, enlarged about its center ``[M]``."""
-    try:
-        corners = points[ConvexHull(points).vertices] if len(points) > 3 else points
-        center = corners.mean(0)
-        return np.asarray(Delaunay(center + grown * (corners - center)).find_simplex(places) >= 0)
-    except (QhullError, ValueError, IndexError):  # flat or too few
-        return np.zeros(places.shape[:-1], bool)

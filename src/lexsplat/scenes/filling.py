@@ -31,10 +31,10 @@ from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
+from lexsplat.geometry.hulls import GROWN, inside_hull
 from lexsplat.language.segments import Segments
 from lexsplat.queries.colors import cielab
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.visibility import inside_hull
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.completing import completed
 from lexsplat.scenes.surfaces import (
@@ -207,7 +207,7 @@ def _fill_below(
         revealed &= ~_standing(local, own & solid, revealed)
     inside |= revealed
     _, coverage, heights = from_above(gaussians, surface, flat & ~inside, photo.cells)
-    near = inside_hull(local[(own | revealed) & (local[:, 2] <= 2 * surface.radius), :2], photo.cells, 1.0)
+    near = inside_hull(local[(own | revealed) & (local[:, 2] <= 2 * surface.radius), :2], photo.cells)
     filled = binary_dilation(unseen, iterations=_OVERLAP)
     hole = filled | ((near | binary_dilation(filled, iterations=_OVERLAP)) & (coverage < _BARE))
     level = np.abs(heights) <= THICK * surface.radius
@@ -284,7 +284,7 @@ def _stuffing(views: Views, own: Mask, gone: Mask) -> Mask:
     """The Gaussians ``[N]`` within a thing's hull that hardly any view sees, because the thing hides them."""
     means = views.gaussians.means.detach().cpu().double().numpy()
     places = np.flatnonzero(~gone)
-    places = places[inside_hull(means[own], means[places])]
+    places = places[inside_hull(means[own], means[places], GROWN)]
     found = np.zeros(len(gone), bool)
     if len(places) and views.of:
         found[places] = covering(views, gone, means[places]) > _STUFFED
