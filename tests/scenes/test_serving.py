@@ -10,6 +10,7 @@ import pytest
 import torch
 from jsonschema import Draft202012Validator
 
+from lexsplat.queries.presence import PresenceClassifier
 from lexsplat.runtime.bounded import Bounded
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.answers import answer_queries, find_phrase
@@ -355,6 +356,36 @@ def test_threads_get_the_answers_of_a_single_one(served_demo):
     assert len(found) == 12
     for phrase, mask in found:
         assert torch.equal(mask, alone[phrase])
+
+
+@pytest.mark.slow
+def test_a_question_and_a_click_wait_for_no_lock_that_the_other_holds(monkeypatch):
+    # Before Python 3.12, all scenes share the lock of a `cached_property`; it is held while colors are embedded.
+    scene, asking, within = open_scene("demo"), threading.Event(), threading.Event()
+    encode, colored = scene.encode_text, PresenceClassifier.colored.fget
+    scene.embed("red mug")
+    scene.question(["mug"])
+
+    def slowly(texts):
+        asking.set()
+        within.wait(5)
+        return encode(texts)
+
+    def listed(classifier):
+        within.set()
+        return colored(classifier)
+
+    monkeypatch.setattr(scene, "encode_text", slowly)
+    monkeypatch.setattr(PresenceClassifier, "colored", property(listed))
+    ask = threading.Thread(target=scene.ask, args=("green mug",), daemon=True)
+    click = threading.Thread(target=scene.question, args=(["red mug"],), daemon=True)
+    ask.start()
+    assert asking.wait(30)
+    click.start()
+    ask.join(30)
+    click.join(30)
+    assert not ask.is_alive()
+    assert not click.is_alive()
 
 
 @pytest.mark.slow

@@ -98,8 +98,9 @@ class Mcp:
             check_output(self.output.resolve())
         scenes, library = self._open()
         server = make_server(scenes, self.output.resolve() if self.allow_write else None, library)
-        for served in scenes.values():  # meanwhile the client connects; the process ends after them
-            threading.Thread(target=served.warm).start()
+        warming = [threading.Thread(target=served.warm) for served in scenes.values()]
+        for thread in warming:  # meanwhile the client connects
+            thread.start()
         # An exception might be raised within an import of the thread above, which would never end then; and nothing
         # else ends the thread that waits for the client's next line.
         before = signal.signal(signal.SIGINT, lambda *_: os._exit(0))
@@ -112,6 +113,8 @@ class Mcp:
             print(f"{', '.join(self.scenes)} served at {address} (Ctrl-C stops the server)", flush=True)
             serve_http(server, listening, self.host, self.token)
         finally:
+            for thread in warming:
+                thread.join()
             signal.signal(signal.SIGINT, before)
 
     def _open(self) -> tuple[dict[str, OpenScene], Library | None]:

@@ -204,7 +204,8 @@ class Scene:
         texts = self.embed(prompts), self.embed(self.query.compared)
         if not self.query.everyday:
             return Question(*texts, self.query)
-        best = self.presence_classifier.best_heights(check_prompts(prompts))
+        with self._working:  # before the locks of the classifier's properties, as everywhere
+            best = self.presence_classifier.best_heights(check_prompts(prompts))
         return Question(*texts, self.query, self.everyday_scale, best)
 
     @property
@@ -442,9 +443,8 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
         BackendError: If "cuda" is asked for and there is no CUDA device.
         ValueError: If the device is not one of the three.
     """
-    place = choose_device(device)
     if not isinstance(path, (str, os.PathLike)):
         expected = "the path of a scene folder"
         raise SceneFolderError(repr(path)[:60], expected=expected, found=type(path).__name__)
-    found = read_scene(Path(path), place)
+    found = read_scene(Path(path), choose_device(device))
     return Scene(found.gaussians, found.field, found.views, found.encoder(clip), found.query, found.folder)
