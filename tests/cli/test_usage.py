@@ -107,7 +107,13 @@ STOPPED = "stopped; run the same command again to go on\n"
 
 
 @pytest.mark.parametrize(
-    "error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")], ids=repr
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("DefaultCPUAllocator: can't allocate memory"),
+        RuntimeError("could not create a primitive"),
+    ],
+    ids=repr,
 )
 def test_a_lack_of_memory_is_named_with_its_remedy(error, monkeypatch, capsys):
     def exhausted(*_, **__):

@@ -29,9 +29,9 @@ from lexsplat.runtime.errors import MemoryBudgetError
 pytestmark = pytest.mark.slow
 
 MEGABYTE = 1 << 20
-VIEWS, WIDTH, HEIGHT = 38, 720, 540
+VIEWS, WIDTH, HEIGHT = 46, 720, 540
 MEMORY = 45 * MEGABYTE
-BESIDE = 120 * MEGABYTE
+BESIDE = 145 * MEGABYTE
 """What one photo on its way, a few hundred Gaussians and threads may take beside the budget."""
 
 BUILD = """
@@ -39,7 +39,10 @@ import json, resource, sys
 from pathlib import Path
 from lexsplat import cli
 from lexsplat.features.encoders import load_clip
-load_clip("bundled", "cpu").encode_text(["warm"])
+import torch
+clip = load_clip("bundled", "cpu")
+clip.encode_text(["warm"])
+clip.encode_patches(torch.zeros(16, 3, 48, 48))
 with open("/proc/self/status") as file:
     before = next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmData"))
 limit = before + int(sys.argv[1])
@@ -49,7 +52,11 @@ if status == 0:
     print(json.dumps(json.loads(Path(sys.argv[2], "scene.json").read_text())["stages"]))
 sys.exit(status)
 """
-"""Builds under a limit of further memory; the last line of its output is the record of the stages."""
+"""Builds under a limit of further memory; the last line of its output is the record of the stages.
+
+The code that oneDNN makes for a processor is made before: it does not depend on the capture, and takes 30 MB more for
+bfloat16.
+"""
 
 USED = (
     "lexsplat.cli", "lexsplat.pipeline", "lexsplat.rendering.cpu_backend", "lexsplat.features.encoders",

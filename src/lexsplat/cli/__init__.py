@@ -72,6 +72,9 @@ _UNSUITABLE = {
 }
 """What is wrong with a path, by the numbers of errors of the system."""
 
+_OUT_OF_MEMORY = ("allocate memory", "not enough memory", "out of memory", "could not create a primitive")
+"""What torch says, in a RuntimeError, where Python raises MemoryError; the last is what oneDNN says."""
+
 ALIASES = {"embed": "language"}
 """Other names of commands."""
 
@@ -106,10 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _discard_output()
         return 0
     except (MemoryError, RuntimeError) as error:
-        # torch raises RuntimeError where Python raises MemoryError.
-        out_of_memory = any(
-            phrase in str(error) for phrase in ("allocate memory", "not enough memory", "out of memory")
-        )
+        out_of_memory = any(phrase in str(error) for phrase in _OUT_OF_MEMORY)
         if not (isinstance(error, MemoryError) or out_of_memory):
             raise
         remedy = "give a smaller --memory, a larger --downscale or a smaller --reconstruction.max-gaussians"
