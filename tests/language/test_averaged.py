@@ -41,7 +41,7 @@ def balls() -> LanguageScene:
 
 
 @pytest.fixture(scope="module")
-def small():
+def small() -> LanguageScene:
     return make_scene(per_ball=6, views=3, width=20, height=15)
 
 

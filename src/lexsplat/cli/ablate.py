@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from lexsplat.cli.arguments import MEASURED_SETTINGS
 from lexsplat.cli.captures import capture_and_settings
 from lexsplat.cli.experiments import open_bench, print_table
-from lexsplat.cli.options import CaptureArgument, PromptListName, check_seeds
+from lexsplat.cli.options import CaptureArgument, PromptListName, ProtocolName, check_seeds
 from lexsplat.cli.settings import Settings
 from lexsplat.language.methods import VARIANTS, MethodName
 from lexsplat.pipeline.config import BuildConfig
@@ -40,6 +40,7 @@ class Ablate:
         ground_truth: Folder with annotations: STEM/PROMPT.png, 3D-OVS masks or LERF-OVS labels.
         prompt_list: Use the prompts of the paper's supplement or of the released code, for scenes of the paper.
         forms: Forms of relevancy, measured side by side. The paper's form is "feature".
+        protocols: Evaluation protocols (docs/evaluation.md).
         json: Print ablation.json on standard output (docs/schemas/ablation.json).
         settings: Settings of all stages; --seed is the seed of the Gaussians.
     """
@@ -53,11 +54,12 @@ class Ablate:
     ground_truth: Path | None = None
     prompt_list: PromptListName | None = None
     forms: tuple[Literal["segment", "code", "feature"], ...] = ("feature",)
+    protocols: tuple[ProtocolName, ...] = ("strict", "official")
     json: bool = False
     settings: Settings = dataclasses.field(default_factory=lambda: BuildConfig(method="trained"))
 
     essential: ClassVar[tuple[str, ...]] = MEASURED_SETTINGS
-    rare: ClassVar[tuple[str, ...]] = ("wrong_labels", "prompt_list", "forms")
+    rare: ClassVar[tuple[str, ...]] = ("wrong_labels", "prompt_list", "forms", "protocols")
     synonyms: ClassVar[dict[str, str]] = {"--masks": "--ground-truth"}
     defaults: ClassVar[dict[str, str]] = {
         "variants": "all that differ for the method",
@@ -80,7 +82,7 @@ class Ablate:
         from lexsplat.evaluation import ablate as ablation
 
         capture, settings = capture_and_settings(self.capture, self.settings)
-        evaluation = ablation.paper_evaluation()
+        evaluation = ablation.paper_evaluation(self.protocols)
         with open_bench(capture, settings, evaluation, self) as bench:
             rows = ablation.ablate(bench, self._plan())
-        print_table(self, "ablation", rows, ablation.COLUMNS)
+        print_table(self, "ablation", rows, ablation.columns_of(evaluation))

@@ -32,6 +32,11 @@ COLUMNS = (
 """Columns of the printed table; ``ablation.json`` has every number."""
 
 
+def columns_of(evaluation: EvaluationConfig) -> tuple[str, ...]:
+    """`COLUMNS`, with mIoU in 3D if its protocol is asked for."""
+    return (*COLUMNS, "lerf_3d_mIoU") if "lerf-3d" in evaluation.protocols else COLUMNS
+
+
 def with_wrong_labels(
     code_maps: Mapping[str, NDArray[np.uint8]], share: float, num_codes: int, seed: int
 ) -> dict[str, NDArray[np.uint8]]:
@@ -131,12 +136,12 @@ def ablate(bench: Bench, plan: AblationPlan | None = None) -> list[dict[str, Any
             for form in plan.forms:
                 row = name if len(plan.forms) == 1 else f"{name}, {form}"
                 rows.append(language_row(bench, row, config, form, plan.wrong_labels))
-    return bench.measure("ablation", rows, plan.seeds, COLUMNS)
+    return bench.measure("ablation", rows, plan.seeds, columns_of(bench.evaluation))
 
 
-def paper_evaluation() -> EvaluationConfig:
-    """Strict and official protocol, without LPIPS, which does not depend on language."""
-    return EvaluationConfig(lpips=False, timing_views=1, protocols=("strict", "official"))
+def paper_evaluation(protocols: Sequence[str] = ("strict", "official")) -> EvaluationConfig:
+    """Strict and official protocol, or others, without LPIPS, which does not depend on language."""
+    return EvaluationConfig(lpips=False, timing_views=1, protocols=tuple(protocols))
 
 
 def language_row(

@@ -32,6 +32,23 @@ class SparseCellWeights:
     first_entries: NDArray[np.int64]
     entry_counts: NDArray[np.int32]
 
+    def owners(self) -> NDArray[np.int32]:
+        """The Gaussian of each entry ``[E]``."""
+        t = self.tiles
+        of_pair = np.repeat(t.order, np.diff(t.pair_offsets))
+        owners = np.empty(len(self.weights), np.int32)
+        shown = self.entry_counts > 0
+        starts, counts = self.first_entries[shown], self.entry_counts[shown]
+        within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        owners[np.repeat(starts, counts) + within] = np.repeat(of_pair[shown], counts)
+        return owners
+
+    def largest(self) -> Tensor:
+        """The largest weight of each Gaussian in one cell ``[N]``."""
+        found = np.zeros(self.tiles.count, np.float32)
+        np.maximum.at(found, self.owners(), self.weights)
+        return torch.from_numpy(found)
+
     def totals(self) -> Tensor:
         """Sum of the weights of each Gaussian ``[N]``."""
         t = self.tiles

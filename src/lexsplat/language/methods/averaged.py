@@ -19,6 +19,7 @@ at each level, from one codebook. u_G is the mean over the levels.
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -78,6 +79,14 @@ class AveragedConfig:
             does so where CLIP is read at class tokens only (`FeatureConfig.crop_tokens`), which gain by it.
         segments: Find segments (`lexsplat.language.segments`), by which questions are answered; without them,
             Gaussians answer one by one.
+        gate: Share of a view's summed weight whose Gaussians take its features, the heaviest first (a Gaussian that
+            never is among them keeps its mean over all views). 1 takes all.
+        least_weight: Gaussians whose weight in a single cell of a feature map stays below this in all views count as
+            never seen, in 0..1.
+        squared: Square the weights of the mean.
+        agreement: Weigh each feature by exp(agreement (cos - 1)), where cos compares it with the Gaussian's mean over
+            all views, in a second pass over them. 0 takes the mean of the first.
+        reliability: Derive u from the length of the mean; without, u is 0 for all that the views show.
     """
 
     top: int = 4
@@ -87,6 +96,11 @@ class AveragedConfig:
     shortest_side: int = 120
     dino: bool | None = None
     segments: bool = True
+    gate: float = 1.0
+    least_weight: float = 0.0
+    squared: bool = False
+    agreement: float = 0.0
+    reliability: bool = True
 
     def __post_init__(self) -> None:
         if self.top < 1 or self.shortest_side < 1:
@@ -95,6 +109,15 @@ class AveragedConfig:
             raise ValueError(f"temperature must be positive, got {self.temperature:g}")
         if self.min_visibility < 0 or self.prior_visibility < 0:
             raise ValueError("min_visibility and prior_visibility must not be negative")
+        if not 0 < self.gate <= 1 or not 0 <= self.least_weight <= 1:
+            raise ValueError("gate and least_weight are shares: above 0 and from 0, at most 1")
+        if not 0 <= self.agreement < math.inf:
+            raise ValueError(f"agreement must not be negative, got {self.agreement:g}")
+
+    @property
+    def weighs_entries(self) -> bool:
+        """Whether `lexsplat.language.methods.lifting` changes the weights alpha T, or needs each of them."""
+        return self.gate < 1 or self.least_weight > 0 or self.squared or self.agreement > 0
 
 
 class Averaged:
@@ -108,6 +131,12 @@ class Averaged:
         "one code": {"averaged": {"top": 1}},
         "w/o DINO": {"averaged": {"dino": False}},
         "with DINO": {"averaged": {"dino": True}},
+        "gate": {"averaged": {"gate": 0.5}},
+        "least weight": {"averaged": {"least_weight": 0.02}},
+        "squared weights": {"averaged": {"squared": True}},
+        "agreement": {"averaged": {"agreement": 5.0}},
+        "w/o reliability": {"averaged": {"reliability": False}},
+        "all liftings": {"averaged": {"gate": 0.5, "least_weight": 0.02, "squared": True, "agreement": 5.0}},
         "full": {},
     }
 
@@ -268,7 +297,8 @@ def field_from_means(
             weights[rows] = torch.softmax(cosines / (config.temperature * spread), 1) * visible[rows, None]
             agreement[rows] = ((halves[0].square().sum(-1) - shared) / (1 - shared)).clamp(0, 1)
     trusted = found.totals / (found.totals + config.prior_visibility).clamp_min(1e-12)
-    uncertainties = torch.where(visible, 1 - agreement * trusted, torch.ones_like(trusted))
+    certain = agreement * trusted if config.reliability else torch.ones_like(trusted)
+    uncertainties = torch.where(visible, 1 - certain, torch.ones_like(trusted))
     return CodeField(
         Codebook(codewords),
         codes.reshape(-1, levels * kept),

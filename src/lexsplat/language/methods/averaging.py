@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from lexsplat.features import FeatureMap, FeatureMaps
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import check_views
+from lexsplat.language.methods.lifting import lifted
 from lexsplat.rendering import BACK_PROJECTED_CHANNELS, prepare, weigh_cells
 from lexsplat.rendering.back_projection import CellWeights, cell_of
 from lexsplat.runtime import memory as budget
@@ -29,6 +30,7 @@ from lexsplat.runtime.workers import IN_PROCESS, Needs, SharedFolder, Workers, r
 
 if TYPE_CHECKING:
     from lexsplat.language.methods.averaged import AveragedConfig
+    from lexsplat.rendering.cell_weights import SparseCellWeights
 
 ROWS = 16_384
 """Gaussians handled at a time outside rendering."""
@@ -124,9 +126,50 @@ def average_features(
     Raises:
         ValueError: If there is no view, a view has no features, or their dimensions differ.
     """
-    names = sorted(cameras)
-    check_views(names, feature_maps)
-    gaussians, count = gaussians.detach(), len(gaussians)
+    check_views(sorted(cameras), feature_maps)
+    device, gaussians = gaussians.device, gaussians.detach()
+    if config.weighs_entries:  # single weights are known to the CPU rasterizer only
+        gaussians = gaussians.to("cpu")
+    run = _Run(dict(cameras), feature_maps, valid, memory, scratch, workers)
+    passes = 2 if config.agreement else 1
+
+    def told(before: int) -> Listener:
+        def listen(event: Event) -> None:
+            done, total = event.done + before * event.total, passes * event.total
+            listener(replace(event, done=done, total=total))
+
+        return listen
+
+    found = _pass(gaussians, replace(config, agreement=0.0), None, run, told(0), last=passes == 1)
+    if passes == 2:
+        found = _pass(gaussians, config, found.means, run, told(1), last=True)
+    return replace(found, totals=found.totals.to(device))
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What both passes over the views share: arguments of `average_features`."""
+
+    cameras: Mapping[str, Camera]
+    feature_maps: Mapping[str, FeatureMap]
+    valid: Valid
+    memory: int
+    scratch: Path | None
+    workers: Workers
+
+
+def _pass(
+    gaussians: Gaussians,
+    config: AveragedConfig,
+    means_before: NDArray[np.float16] | None,
+    run: _Run,
+    listener: Listener,
+    *,
+    last: bool,
+) -> MeanFeatures:
+    """One pass over all views; the last one forgets the features that it has read."""
+    names, count, feature_maps = sorted(run.cameras), len(gaussians), run.feature_maps
+    memory, scratch, workers = run.memory, run.scratch, run.workers
     first = feature_maps[names[0]]
     with_dino = first.dino.shape[-1] if config.dino and first.dino is not None else 0
     dimensions, levels, nbytes = _features(first, with_dino).shape[-1], len(first.levels) or 1, first.nbytes
@@ -136,10 +179,15 @@ def average_features(
     means = _store(count, dimensions, sums_bound(torch.device("cpu"), memory), scratch)
     shards = view_shards(names)
     seen = _is_seen(workers, scratch)
-    shared = _Averaging(gaussians, dict(cameras), feature_maps if seen else {}, config, valid, with_dino)
+    shared = _Averaging(
+        gaussians, run.cameras, feature_maps if seen else {}, config, run.valid, with_dino, means_before
+    )
     carried = 0 if seen else len(shards[0]) * nbytes
-    needs = Needs(gpu=gaussians.device.type == "cuda", result=4 * count * (len(ranges[0]) + 1) + carried)
+    needs = Needs(gpu=gaussians.device.type == "cuda", result=4 * count * (len(ranges[0]) + 3) + carried)
     totals = torch.zeros(count, device=gaussians.device)
+    # What the sums are divided by, which is the total but for other weights than alpha T.
+    norms, largest = (torch.zeros_like(totals) if config.weighs_entries else totals), torch.zeros_like(totals)
+    least = 1e-12 if norms is totals else 1e-30
     done = 0
     listener(Event("average", done, len(ranges) * len(names)))
     for columns in ranges:
@@ -148,15 +196,20 @@ def average_features(
         for part, weights, views in results(workers.map(_shard_sums, shared, items, needs)):
             sums += part.to(sums.device)
             if columns.start == 0:
-                totals += weights.to(sums.device)
+                totals += weights[0].to(sums.device)
+                if norms is not totals:
+                    norms += weights[1]
+                    torch.maximum(largest, weights[2], out=largest)
             done += views
-            if columns is ranges[-1] and isinstance(feature_maps, FeatureMaps):
+            if last and columns is ranges[-1] and isinstance(feature_maps, FeatureMaps):
                 feature_maps.forget()  # nothing reads them again, and all of them are hundreds of megabytes
             listener(Event("average", done, len(ranges) * len(names), workers.metrics))
         for start in range(0, count, ROWS):
             rows = slice(start, start + ROWS)
-            mean = sums[rows] / totals[rows, None].clamp_min(1e-12)
+            mean = sums[rows] / norms[rows, None].clamp_min(least)
             means[rows, columns.start : columns.stop] = mean.cpu().numpy().astype(np.float16)
+    if config.least_weight:
+        totals *= largest >= config.least_weight
     return MeanFeatures(means, totals, with_dino, levels)
 
 
@@ -209,7 +262,7 @@ class _Shards(Mapping[str, _Shard]):
 
 @dataclass(frozen=True)
 class _Averaging:
-    """Inputs shared by the sums of all shards: arguments of `average_features`."""
+    """Inputs shared by the sums of all shards: arguments of `average_features`, and the means of the first pass."""
 
     gaussians: Gaussians
     cameras: Mapping[str, Camera]
@@ -217,6 +270,7 @@ class _Averaging:
     config: AveragedConfig
     valid: Valid
     with_dino: int
+    means: NDArray[np.float16] | None
 
 
 def view_shards(names: Sequence[str]) -> list[tuple[str, ...]]:
@@ -230,23 +284,31 @@ def view_shards(names: Sequence[str]) -> list[tuple[str, ...]]:
 
 @threads_for_kernels()
 def _shard_sums(shared: _Averaging, item: _Shard) -> tuple[Tensor, Tensor, int]:
-    """The sums of some views over a range of dimensions ``[N, len(columns)]``, of weights ``[N]``, and the views."""
+    """The sums of some views over a range of dimensions ``[N, len(columns)]``, the weights ``[1, N]``, and the views.
+
+    Weights other than alpha T have three rows: the sums of alpha T, those of the weights, and the largest alpha T.
+    """
     names, columns, dimensions, carried = item
     maps = shared.feature_maps if carried is None else carried
-    gaussians = shared.gaussians
+    gaussians, config = shared.gaussians, shared.config
     sums = torch.zeros(len(gaussians), len(columns), device=gaussians.device)
-    totals = torch.zeros(len(gaussians), device=gaussians.device)
+    totals = torch.zeros(3 if config.weighs_entries else 1, len(gaussians), device=gaussians.device)
     for name in names:
         found = maps[name]
         features = _features(found, shared.with_dino)
         if features.shape[-1] != dimensions:
             raise ValueError(f"features of {name} have {features.shape[-1]} dimensions, others {dimensions}")
-        camera = _at_map_size(shared.cameras[name], features, gaussians.antialiased, shared.config)
+        camera = _at_map_size(shared.cameras[name], features, gaussians.antialiased, config)
         counting = shared.valid(name, (camera.width, camera.height))
-        weights = _cell_weights(gaussians, camera, found.clip, counting)
-        weights.add_to(sums, features.flatten(0, 1)[:, columns.start : columns.stop])
+        weights, features = _cell_weights(gaussians, camera, found.clip, counting), features.flatten(0, 1)
         if columns.start == 0:
-            totals += weights.totals()
+            totals[0] += weights.totals()
+        if config.weighs_entries:
+            entries = cast("SparseCellWeights", weights)  # of Gaussians on the CPU
+            torch.maximum(totals[2], entries.largest(), out=totals[2])
+            weights = lifted(entries, features, shared.means, config)
+            totals[1] += weights.totals()
+        weights.add_to(sums, features[:, columns.start : columns.stop])
     return sums, totals, len(names)
 
 
