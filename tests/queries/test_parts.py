@@ -8,7 +8,7 @@ from support.splats import solid
 
 from lexsplat.geometry.gaussians import SH_C0
 from lexsplat.queries import parts
-from lexsplat.queries.parts import part_scores, with_parts
+from lexsplat.queries.parts import ThingGraph, part_scores, with_parts
 from lexsplat.queries.segments import SEGMENT_THRESHOLD
 
 BROWN, TAN, BLACK = (0.4, 0.25, 0.1), (0.7, 0.55, 0.35), (0.05, 0.05, 0.05)
@@ -36,12 +36,17 @@ def bear():
     return replace(gaussians, sh0=sh0), places
 
 
+def cut(own, thing, gaussians, masses):
+    """The scores of a part of a thing ``[N]`` bool."""
+    return part_scores(own, ThingGraph.of(thing, gaussians, masses))
+
+
 def taken(scores, gaussians, places, masses=None):
     """The Gaussians ``[N]`` bool of a part whose relevancies are those of places."""
     rng = np.random.default_rng(1)
     own = torch.from_numpy(np.array(scores)[places] + rng.normal(0, 0.02, len(places))).clamp(0, 1).float()
     masses = torch.ones(len(places)) if masses is None else masses
-    found = part_scores(own, torch.from_numpy(places != TABLE), gaussians, masses)
+    found = cut(own, torch.from_numpy(places != TABLE), gaussians, masses)
     assert 0 <= float(found.min()) <= float(found.max()) <= 1
     return (found >= SEGMENT_THRESHOLD).numpy()
 
@@ -89,7 +94,7 @@ def test_a_part_grows_from_its_best_scores_to_where_it_meets_its_thing(monkeypat
     own, thing = torch.from_numpy(scores).float(), torch.ones(len(near), dtype=torch.bool)
 
     def found() -> np.ndarray:
-        return (part_scores(own, thing, gaussians, thing.float()) >= SEGMENT_THRESHOLD).numpy()
+        return (cut(own, thing, gaussians, thing.float()) >= SEGMENT_THRESHOLD).numpy()
 
     assert share(found(), near >= 0) > 0.8
     monkeypatch.setattr(parts, "NEAREST", 1.0)
@@ -101,7 +106,7 @@ def test_a_part_does_not_grow_where_nothing_stops_it():
     head = gaussians.means[:, 2].numpy()
     scores = np.where(places == TABLE, 0.1, np.where(head > 0.9, 0.9, 0.2 + 0.4 * np.clip(head, 0, 1)))
     own, thing = torch.from_numpy(scores).float(), torch.from_numpy(places != TABLE)
-    grown = (part_scores(own, thing, gaussians, torch.ones(len(places))) >= SEGMENT_THRESHOLD).numpy()
+    grown = (cut(own, thing, gaussians, torch.ones(len(places))) >= SEGMENT_THRESHOLD).numpy()
     assert (grown & (head < 0.6)).sum() == 0, "around the top of a ball each wider border is longer"
 
 
@@ -123,14 +128,14 @@ def test_a_part_grows_only_to_a_border_of_at_most_half_the_length(neck, taken):
 def test_a_part_with_a_border_of_its_own_does_not_grow_to_another_one():
     gaussians, places = bear()
     own = torch.from_numpy(np.array([0.1, 0.2, 0.5, 0.9, 0.1])[places]).float()
-    found = part_scores(own, torch.from_numpy(places != TABLE), gaussians, torch.ones(len(places)))
+    found = cut(own, torch.from_numpy(places != TABLE), gaussians, torch.ones(len(places)))
     assert share((found >= SEGMENT_THRESHOLD).numpy(), places == NOSE) > 0.9, "not the muzzle"
 
 
 def test_a_pixel_that_shows_a_part_for_the_most_part_shows_it():
     gaussians, places = bear()
     own = torch.from_numpy(np.array([0.1, 0.1, 0.75, 0.9, 0.1])[places]).float()
-    found = part_scores(own, torch.from_numpy(places != TABLE), gaussians, torch.ones(len(places)))
+    found = cut(own, torch.from_numpy(places != TABLE), gaussians, torch.ones(len(places)))
     inside = found[found >= SEGMENT_THRESHOLD]
     assert 0.7 * float(inside.min()) > SEGMENT_THRESHOLD
 
@@ -146,7 +151,7 @@ def test_noise_of_single_gaussians_does_not_tear_a_part():
     gaussians, places = bear()
     rng = np.random.default_rng(2)
     own = torch.from_numpy(np.array([0.1, 0.2, 0.2, 0.2, 0.8])[places] + rng.normal(0, 0.2, len(places)))
-    found = part_scores(
+    found = cut(
         own.clamp(0, 1).float(), torch.from_numpy(places != TABLE), gaussians, torch.ones(len(places))
     )
     alone = own.numpy() >= 0.5
@@ -169,15 +174,15 @@ def test_the_order_of_the_gaussians_does_not_matter():
     own = torch.from_numpy(np.array([0.1, 0.1, 0.75, 0.9, 0.1])[places]).float()
     thing, masses = torch.from_numpy(places != TABLE), torch.ones(len(places))
     order = torch.randperm(len(places), generator=torch.Generator().manual_seed(3))
-    straight = part_scores(own, thing, gaussians, masses)
-    turned = part_scores(own[order], thing[order], gaussians.select(order), masses)
+    straight = cut(own, thing, gaussians, masses)
+    turned = cut(own[order], thing[order], gaussians.select(order), masses)
     torch.testing.assert_close(turned, straight[order], rtol=1e-4, atol=1e-4)
 
 
 def test_a_thing_that_is_described_as_the_part_throughout_is_not_cut():
     gaussians, places = bear()
     own = torch.from_numpy(np.array([0.1, 0.8, 0.8, 0.9, 0.8])[places]).float()
-    assert part_scores(own, torch.from_numpy(places != TABLE), gaussians, torch.ones(len(places))) is None
+    assert cut(own, torch.from_numpy(places != TABLE), gaussians, torch.ones(len(places))) is None
 
 
 def test_a_part_that_the_name_of_the_thing_misses_is_joined_but_nothing_apart_from_it():
@@ -189,3 +194,27 @@ def test_a_part_that_the_name_of_the_thing_misses_is_joined_but_nothing_apart_fr
     found = with_parts(thing, taken, gaussians, labels)
     assert torch.equal(found, torch.from_numpy(places != TABLE))
     assert torch.equal(with_parts(thing, thing, gaussians, labels), thing)
+
+
+def test_links_are_those_between_neighbors_by_how_alike_they_are():
+    gaussians, places = bear()
+    thing = torch.from_numpy(places != TABLE)
+    masses = torch.from_numpy(np.random.default_rng(4).uniform(0, 2, len(places))).float()
+    graph = ThingGraph.of(thing, gaussians, masses)
+    values = np.random.default_rng(5).uniform(0, 1, len(graph.places))
+    chosen = gaussians.select(thing.nonzero()[:, 0])
+    means, colors = (
+        chosen.means.double().numpy(),
+        (0.5 + SH_C0 * chosen.sh0[:, 0].double().numpy()).clip(0, 1),
+    )
+    apart = np.linalg.norm(means[:, None] - means[None], axis=-1)
+    nearest = np.zeros_like(apart, bool)
+    np.put_along_axis(
+        nearest, np.argsort(apart, axis=1, kind="stable")[:, 1 : parts.NEIGHBORS + 1], True, axis=1
+    )
+    nearest |= nearest.T
+    unlike = ((colors[:, None] - colors[None]) ** 2).sum(-1) / parts.COLOR**2
+    unlike += (values[:, None] - values[None]) ** 2 / parts.SCORE**2
+    expected = np.where(nearest, np.exp(-unlike) * masses.numpy()[graph.places][None], 0)
+    expected /= expected.sum(1, keepdims=True)
+    np.testing.assert_allclose(graph.links(values).toarray(), expected, atol=1e-6)

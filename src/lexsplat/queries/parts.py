@@ -19,6 +19,8 @@ The constants were chosen on the second bundled scene and on the scene ``parts``
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -90,52 +92,83 @@ def with_parts(thing: Tensor, taken: Tensor, gaussians: Gaussians, labels: Tenso
     return joined
 
 
+@dataclass(frozen=True)
+class ThingGraph:
+    """A thing as its parts are cut: what does not depend on the part.
+
+    Args:
+        places: Its Gaussians ``[M]``.
+        weights: Their visible weights in the training views ``[M]`` float64.
+        starts: First link of each, in the order of `places` ``[M + 1]``.
+        ends: The neighbor at the other end of each link ``[E]``.
+        apart: Squared difference of the colors at both ends ``[E]`` float64, in units of `COLOR`.
+    """
+
+    places: Tensor
+    weights: FloatArray
+    starts: NDArray[np.int64]
+    ends: NDArray[np.int32]
+    apart: FloatArray
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, thing: Tensor, gaussians: Gaussians, masses: Tensor) -> ThingGraph:
+        """The graph of a thing.
+
+        Args:
+            thing: The Gaussians of the thing ``[N]`` bool, at least `FEWEST`.
+            gaussians: The scene.
+            masses: Visible weight of each Gaussian in the training views ``[N]``.
+        """
+        places = thing.nonzero()[:, 0].cpu()
+        means = gaussians.means.detach().cpu()[places].double().numpy()
+        colors = (0.5 + SH_C0 * gaussians.sh0.detach()[:, 0].cpu()[places]).clamp(
+            0, 1
+        ).double().numpy() / COLOR
+        count, neighbors = len(means), min(NEIGHBORS + 1, len(means))
+        found = cKDTree(means).query(means, k=neighbors, workers=kernel_threads())[1][:, 1:]
+        first = np.arange(0, found.size + 1, neighbors - 1)
+        links = csr_array((np.ones(found.size), found.ravel(), first), shape=(count, count))
+        links = links.maximum(links.T)  # a neighbor of either
+        owners = np.repeat(np.arange(count), np.diff(links.indptr))
+        apart = np.square(colors[owners] - colors[links.indices]).sum(-1)
+        weights = masses.cpu()[places].double().numpy()
+        return cls(places, weights, links.indptr.astype(np.int64), links.indices.astype(np.int32), apart)
+
+    def links(self, values: FloatArray) -> csr_array:
+        """Links ``[M, M]`` by how alike the colors and ``values [M]`` of their ends are; each row adds up to 1."""
+        count, lengths = len(values), np.diff(self.starts)
+        differences = (np.repeat(values, lengths) - values[self.ends]) / SCORE
+        weighted = np.exp(-self.apart - differences * differences) * self.weights[self.ends]
+        weighted /= np.repeat(np.maximum(np.add.reduceat(weighted, self.starts[:-1]), 1e-9), lengths)
+        return csr_array((weighted, self.ends, self.starts), shape=(count, count))
+
+
 @torch.no_grad()
-def part_scores(relevancy: Tensor, thing: Tensor, gaussians: Gaussians, masses: Tensor) -> Tensor | None:
+def part_scores(relevancy: Tensor, thing: ThingGraph) -> Tensor | None:
     """Scores of a part; None if nearly all of its thing is described as the part and nothing is to be cut.
 
     Args:
         relevancy: Relevancy of each Gaussian by itself ``[N]`` in 0..1.
-        thing: The Gaussians of its thing ``[N]`` bool, at least `FEWEST`.
-        gaussians: The scene.
-        masses: Visible weight of each Gaussian in the training views ``[N]``.
+        thing: Its thing.
 
     Returns:
         ``[N]`` in 0..1, on the device of ``relevancy``; at least `SEGMENT_THRESHOLD` exactly in the part.
     """
-    places = thing.nonzero()[:, 0].cpu()
+    places, weights = thing.places, thing.weights
     own = relevancy.cpu().double().numpy()
-    weights = masses.cpu()[places].double().numpy()
-    means = gaussians.means.detach().cpu()[places].double().numpy()
-    colors = (0.5 + SH_C0 * gaussians.sh0.detach()[:, 0].cpu()[places]).clamp(0, 1).double().numpy()
-    links = _links(own[places], means, colors, weights)
-    smooth = own[places]
+    inside = own[places.numpy()]
+    links, smooth = thing.links(inside), inside
     for _ in range(ROUNDS):
-        smooth = (1 - SHARED) * own[places] + SHARED * (links @ smooth)
+        smooth = (1 - SHARED) * inside + SHARED * (links @ smooth)
     if _quantile(smooth, weights, LOWEST) >= ALL:
         return None
     base, border, best = _border(smooth, weights)
     part = _grown(smooth, base, border, links)
     scores = OUTSIDE * np.minimum(own / border, 1)
-    inside = FIRM + (1 - FIRM) * np.clip((smooth - border) / max(best - border, 1e-6), 0, 1)
-    scores[places] = np.where(part, 1 + inside, np.minimum(smooth / border, 1 - 1e-4))
+    firm = FIRM + (1 - FIRM) * np.clip((smooth - border) / max(best - border, 1e-6), 0, 1)
+    scores[places.numpy()] = np.where(part, 1 + firm, np.minimum(smooth / border, 1 - 1e-4))
     return torch.from_numpy(SEGMENT_THRESHOLD * scores).to(relevancy)
-
-
-def _links(values: FloatArray, means: FloatArray, colors: FloatArray, weights: FloatArray) -> csr_array:
-    """Links ``[M, M]`` to neighbors, by how alike their colors and ``values`` are; they add up to 1 for each."""
-    count, neighbors = len(values), min(NEIGHBORS + 1, len(values))
-    found = cKDTree(means).query(means, k=neighbors, workers=kernel_threads())[1][:, 1:]
-    features = np.column_stack([colors / COLOR, values / SCORE])
-    apart = features[found]
-    apart -= features[:, None]
-    starts = np.arange(0, found.size + 1, neighbors - 1)
-    weighted = np.exp(-np.einsum("mkc,mkc->mk", apart, apart)).ravel()
-    links = csr_array((weighted, found.ravel(), starts), shape=(count, count))
-    links = links.maximum(links.T)
-    links.data *= weights[links.indices]
-    links.data /= np.repeat(np.maximum(links.sum(1), 1e-9), np.diff(links.indptr))
-    return links
 
 
 def _grown(smooth: FloatArray, base: float, border: float, links: csr_array) -> NDArray[np.bool_]:

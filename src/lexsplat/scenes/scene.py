@@ -27,6 +27,7 @@ from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
 from lexsplat.language.fields import LanguageField
 from lexsplat.queries.everyday import EverydayScale, everyday_words
+from lexsplat.queries.parts import ThingGraph
 from lexsplat.queries.phrases import Understood
 from lexsplat.queries.picking import Hit, point_at, select_hit, surface_at
 from lexsplat.queries.presence import PresenceClassifier
@@ -108,6 +109,7 @@ class Scene:
             own, common = (root / "checkpoints" / "texts" for root in (folder.root, BUNDLED_SCENE))
             self._cache = texts_of_scene(own, shipped=folder.is_bundled, common=common)
         self._texts: Bounded[str, Tensor] = Bounded(_KEPT_TEXTS)
+        self.graphs: Bounded[str, ThingGraph] = Bounded(16)  # of things whose parts were asked for
 
     def __repr__(self) -> str:
         place = f", folder={str(self.folder.root)!r}" if self.folder else ""
@@ -237,8 +239,7 @@ class Scene:
         given = None if threshold is None else check_threshold(threshold)
         words_of = self._words  # another query replaces it
         found = {prompt: words_of.get(prompt) for prompt in dict.fromkeys(prompts)}
-        new = [prompt for prompt, word in found.items() if word is None]
-        if new:
+        if new := [prompt for prompt, word in found.items() if word is None]:
             # A part is cut within its thing, which is asked for with it.
             things = (thing for thing in map(thing_of_part, new) if thing and words_of.get(thing) is None)
             new = list(dict.fromkeys([*things, *new]))
@@ -415,9 +416,8 @@ class Scene:
         Raises:
             QueryError: If the view is unknown.
         """
-        if isinstance(view, Camera):
-            return view
-        return view.camera if isinstance(view, StoredView) else self.view(view).camera
+        found = view if isinstance(view, (Camera, StoredView)) else self.view(view)
+        return found if isinstance(found, Camera) else found.camera
 
     def view(self, name: str) -> StoredView:
         """The view called ``name`` (`lexsplat.scenes.views.view_named`).

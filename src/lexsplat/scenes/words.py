@@ -12,13 +12,14 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from lexsplat.queries.colors import color_told, is_qualified, may_be
 from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.part_names import DOUBTFUL, is_doubtful
-from lexsplat.queries.parts import FEWEST, part_scores, with_parts
+from lexsplat.queries.parts import FEWEST, ThingGraph, part_scores, with_parts
 from lexsplat.queries.presence import FAINT
 from lexsplat.queries.relevancy import gaussian_relevancy
 from lexsplat.queries.scoring import form_used, scores_in_form
@@ -26,6 +27,7 @@ from lexsplat.queries.selection import Presence, Selection, union
 from lexsplat.queries.thresholds import BORDER
 from lexsplat.queries.vocabulary import STUFF, SURFACES, is_part, is_part_alone, part_named, thing_of_part
 from lexsplat.runtime.device import threads_for_kernels
+from lexsplat.runtime.fingerprints import digest
 from lexsplat.scenes.gone import gone_nouns, noun_of
 from lexsplat.scenes.listed import doubt, holding, listed_as, listed_under
 from lexsplat.scenes.pixels import object_colors, seen_colors
@@ -40,6 +42,8 @@ _PIECE = 0.3
 """Share of an object of its name from which a word is that object."""
 _PER_THREAD = 100_000
 """Gaussians for each thread of torch: with fewer, waiting for each other costs more than it saves."""
+_KEPT_GRAPH = 20_000
+"""Gaussians of the largest thing whose graph is kept: it takes about 200 bytes for each."""
 
 
 @dataclass(eq=False)
@@ -170,9 +174,17 @@ def of_part(scene: Scene, prompt: str, word: Word) -> Word:
     if found.presences[0] == "no" or int(thing.sum()) < FEWEST:
         return word
     thing = with_parts(thing, taken, scene.gaussians, segments.labels)
-    scores = part_scores(word.own, thing, scene.gaussians, segments.masses)
+    scores = part_scores(word.own, _graph_of(scene, thing, segments.masses))
     word = word if scores is None else replace(word, scores=scores)
     return replace(word, presence="unsure", note=DOUBTFUL) if _is_doubtful(scene, prompt, word) else word
+
+
+def _graph_of(scene: Scene, thing: Tensor, masses: Tensor) -> ThingGraph:
+    """The graph of a thing; kept, for its other parts, unless it is as large as a room."""
+    if int(thing.sum()) > _KEPT_GRAPH:
+        return ThingGraph.of(thing, scene.gaussians, masses)
+    key = digest([np.packbits(thing.cpu().numpy()).tobytes()])
+    return scene.graphs.get_or_make(key, lambda: ThingGraph.of(thing, scene.gaussians, masses))
 
 
 def _is_doubtful(scene: Scene, prompt: str, word: Word) -> bool:
