@@ -49,6 +49,20 @@ def test_bars_in_a_terminal_state_rate_and_time_left(monkeypatch):
     assert "psnr 20" in screen.getvalue()
 
 
+def test_a_bar_of_units_that_take_long_states_rate_and_time_left_after_the_first(clock, monkeypatch):
+    screen = io.StringIO()
+    monkeypatch.setattr(
+        progress, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120, _environ={})
+    )
+    with ProgressBars() as bars:
+        bars(Event("poses", 0, 25))
+        clock[0] += 40.0
+        bars(Event("poses", 8, 25))
+    assert "5.0 s each" in screen.getvalue()
+    assert "0:01:25" in screen.getvalue()
+    assert "-:--:--" not in screen.getvalue().split("8/25")[-1]
+
+
 def test_what_is_printed_into_a_pipe_stays_on_standard_output_while_bars_show(monkeypatch, capsys):
     screen = io.StringIO()
     monkeypatch.setattr(progress, "Console", lambda **_: Console(file=screen, force_terminal=True))

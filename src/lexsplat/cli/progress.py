@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
+from datetime import timedelta
 from types import TracebackType
 
 from rich.console import Console
@@ -30,11 +31,26 @@ _ENDS = ("finished", "failed")
 """Stages by which events say that a scene of several has ended."""
 
 
+def _speed(task: Task) -> float | None:
+    """Units a second: of the last seconds, or of the whole stage where units take longer."""
+    return task.finished_speed or task.speed or task.fields["rate"] or None
+
+
 class _RateColumn(ProgressColumn):
     """The column of the rate."""
 
     def render(self, task: Task) -> Text:
-        return Text(format_rate(task.finished_speed or task.speed), style="dim")
+        return Text(format_rate(_speed(task)), style="dim")
+
+
+class _TimeLeftColumn(TimeRemainingColumn):
+    """The column of the time left."""
+
+    def render(self, task: Task) -> Text:
+        speed, left = _speed(task), task.remaining
+        if task.time_remaining is not None or speed is None or left is None:
+            return super().render(task)
+        return Text(str(timedelta(seconds=int(left / speed))), style="progress.remaining")
 
 
 def format_rate(per_second: float | None) -> str:
@@ -62,7 +78,7 @@ class ProgressBars:
             MofNCompleteColumn(),
             _RateColumn(),
             TimeElapsedColumn(),
-            TimeRemainingColumn(),
+            _TimeLeftColumn(),
             TextColumn("[dim]{task.fields[metrics]}"),
             console=self.console,
             # What is piped is data and stays on standard output, which is None if it is closed.
@@ -89,12 +105,13 @@ class ProgressBars:
         kept = bool(event.metrics.get("kept"))
         numbers = " ".join(f"{name} {value:.5g}" for name, value in event.metrics.items() if name != "kept")
         text = "kept from the last run" if kept else numbers
+        rate = self._pace.rate(event)
         if self.console.is_terminal:
-            self._draw(event, text)
+            self._draw(event, text, rate)
         elif not (event.scene and event.stage in _ENDS):
-            self._print_line(event, text)
+            self._print_line(event, text, rate)
 
-    def _draw(self, event: Event, text: str) -> None:
+    def _draw(self, event: Event, text: str, rate: float) -> None:
         """A bar for each stage; of several scenes, a bar for each scene under way, with its present stage."""
         if event.scene and event.stage in _ENDS:
             if event.scene in self._tasks:
@@ -103,7 +120,7 @@ class ProgressBars:
         key, title = (event.scene, f"{event.scene}: {event.stage}") if event.scene else (event.stage,) * 2
         total = event.total if event.total > 1 or event.done else None  # None draws a pulse
         if key not in self._tasks:
-            self._tasks[key] = self._progress.add_task(title, total=total, metrics="")
+            self._tasks[key] = self._progress.add_task(title, total=total, metrics="", rate=0.0)
         task = next(task for task in self._progress.tasks if task.id == self._tasks[key])
         if (
             event.done < task.completed or task.description != title
@@ -112,10 +129,10 @@ class ProgressBars:
         if event.stage in self._began:
             task.start_time = self._began.pop(event.stage)
         task.total = total  # `update` keeps the old one where it gets None
-        self._progress.update(task.id, completed=event.done, metrics=text)
+        self._progress.update(task.id, completed=event.done, metrics=text, rate=rate)
 
-    def _print_line(self, event: Event, text: str) -> None:
-        now, rate = time.monotonic(), self._pace.rate(event)
+    def _print_line(self, event: Event, text: str, rate: float) -> None:
+        now = time.monotonic()
         name = f"{event.scene}: {event.stage}" if event.scene else event.stage
         if event.total == 1 and not event.done:
             line = f"{format_seconds(now - self._began.setdefault(name, now))} so far"

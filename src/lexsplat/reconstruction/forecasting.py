@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.reconstruction.trainer import STAGE, Reconstructor
@@ -18,11 +19,13 @@ from lexsplat.runtime.training import Training, time_steps
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, InitialPoints
 
-_TOLD_FROM = 500
-"""Fewest iterations with a forecast; the calibration takes as long as about thirty of them."""
-_FIRST = 2
-"""Steps that are not timed."""
+_TOLD_FROM = 1000
+"""Fewest iterations with a forecast; the calibration takes as long as about a hundred of them."""
+_FIRST = 24
+"""Steps that are not timed: the first Gaussians are large and faint, and take up to seven times as long."""
 _STEPS = 4
+_NEIGHBORS = 3
+"""Neighbors whose mean distance is that of a copy from its point, as with the size of the first Gaussians."""
 _GROWTH = {"default": 1.45, "mcmc": 1.05}
 """Factor by which a round of density control multiplies the number of Gaussians; 1.4 to 1.55 on the bundled captures
 with "default", and by definition with "mcmc"."""
@@ -99,13 +102,16 @@ def _counts(config: ReconstructionConfig, start: int, cap: int) -> NDArray[np.fl
 
 
 def _grown(points: InitialPoints, count: int) -> InitialPoints:
-    """As many points as there may be Gaussians: copies near the given ones, at about their distance."""
-    repeats = max(1, -(-count // len(points.points)))
-    generator = np.random.default_rng(0)
-    spread = 0.01 * points.points.std(0)
-    copies = [points.points + spread * generator.standard_normal(points.points.shape) for _ in range(repeats)]
+    """As many points as there may be Gaussians: the given ones, and copies about as far away as their neighbors."""
+    repeats, generator = max(1, -(-count // len(points.points))), np.random.default_rng(0)
+    near = min(_NEIGHBORS + 1, len(points.points))
+    distances = cKDTree(points.points).query(points.points, k=range(1, near + 1))[0]
+    spread = distances.sum(1, keepdims=True) / max(1, near - 1)  # the first is the point itself
+    copies = [spread * generator.standard_normal(points.points.shape) for _ in range(repeats - 1)]
     return replace(
         points,
-        points=np.concatenate(copies).astype(points.points.dtype)[:count],
+        points=np.concatenate([points.points, *(points.points + copy for copy in copies)])[:count].astype(
+            points.points.dtype
+        ),
         colors=np.concatenate([points.colors] * repeats)[:count],
     )

@@ -124,13 +124,11 @@ class FirstUnits:
     Args:
         stage: Name of the stage.
         units: Plural of the unit, such as "photos".
+        enough: Seconds that are measured, at least; more where the first units take longer than others.
     """
 
-    _ENOUGH = 1.0
-    """Seconds that are measured, at least."""
-
-    def __init__(self, stage: str, units: str) -> None:
-        self._stage, self._units = stage, units
+    def __init__(self, stage: str, units: str, enough: float = 1.0) -> None:
+        self._stage, self._units, self._enough = stage, units, enough
         self._start, self._told = 0.0, False
 
     def __call__(self, done: int, total: int) -> None:
@@ -138,7 +136,7 @@ class FirstUnits:
         if not done:
             self._start, self._told = time.monotonic(), False
         seconds = time.monotonic() - self._start
-        if seconds >= self._ENOUGH and 0 < done <= total / 2 and not self._told:
+        if seconds >= self._enough and 0 < done <= total / 2 and not self._told:
             self._told = True
             tell(self._stage, seconds / done * total, f"{total:,} {self._units}")
 

@@ -34,6 +34,8 @@ EXHAUSTIVE_LIMIT = 80
 """Up to this many photos every pair is matched; beyond it, photos are assumed to follow one another by name."""
 
 _WORK = ".poses"
+_SETTLED = 10.0
+"""Seconds of matching before its time is told: the first pairs of photos take two to three times as long as later."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,8 @@ def poses_from_photos(
     work = _work_folder(output, photos, config, seed)
     database = work / "database.db"
     is_new = not database.exists()  # what an earlier run has done took no time in this one
-    tell_features, tell_pairs = FirstUnits("SIFT features", "photos"), FirstUnits(MATCHING, "pairs")
+    tell_features = FirstUnits("SIFT features", "photos")
+    tell_pairs = FirstUnits(MATCHING, "pairs", _SETTLED)
 
     def report(done: int) -> None:
         _report(listener, photos, done)

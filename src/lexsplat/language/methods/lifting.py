@@ -1,7 +1,7 @@
 """How much of a view's features each Gaussian takes, where that is not the weight alpha T alone.
 
 Ways of lifting that others found better than the weighted mean. Each is a setting of method "averaged", and off by
-default, because none gains here (docs/lab-notes/2026-11-objects.md):
+default; docs/lab-notes/2026-11-objects.md has what each gains:
 
 - ``gate``: a view gives its features to the Gaussians that make up the first share of its summed weight, the heaviest
   first (VALA, "visibility-aware language aggregation").
