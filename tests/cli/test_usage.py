@@ -111,7 +111,7 @@ STOPPED = "stopped; run the same command again to go on\n"
     [
         MemoryError(),
         RuntimeError("DefaultCPUAllocator: can't allocate memory"),
-        RuntimeError("could not create a primitive"),
+        RuntimeError("could not create a primitive\n"),
     ],
     ids=repr,
 )

@@ -91,6 +91,24 @@ def test_squared_weights_are_those_of_single_pixels(small, feature_maps, weighed
     assert np.abs(mean_of(weighed) - expected)[seen].max() > 0.05
 
 
+def test_cells_that_cross_a_border_of_tiles_count_as_wholes(small, feature_maps, weighed) -> None:
+    """Maps of 6 x 7 cells: cells of about 3 pixels, one of which holds pixels 15 and 16, of two tiles."""
+    coarse = {name: FeatureMap(found.clip[:6, :7].contiguous()) for name, found in feature_maps.items()}
+    rows, columns = ((2 * np.arange(size) + 1) * cells // (2 * size) for size, cells in ((15, 6), (20, 7)))
+    assert columns[15] == columns[16]
+    cells, views = (rows[:, None] * 7 + columns).ravel(), []
+    for (weights, _), found in zip(weighed, coarse.values()):
+        of_cells = np.stack([np.bincount(cells, row, minlength=42) for row in weights]) * 42 / 300
+        views.append((of_cells, found.clip.double().flatten(0, 1).numpy()))
+    best = np.max([weights.max(1) for weights, _ in views], axis=0)
+    found, limit = averaged(small, coarse, squared=True), float(np.median(best))
+    expected, seen = mean_of([(w**2, f) for w, f in views]), found.totals.numpy() > 0.05
+    np.testing.assert_allclose(found.means[seen], expected[seen], atol=3e-3)
+    shown = averaged(small, coarse, least_weight=limit).totals.numpy() > 0
+    sure = np.abs(best - limit) > 1e-4
+    assert np.array_equal(shown[sure], (best > limit)[sure])
+
+
 def test_features_count_by_their_agreement_with_the_mean_of_a_first_pass(
     small, feature_maps, weighed
 ) -> None:
@@ -138,7 +156,9 @@ def test_ranges_of_dimensions_change_no_bit(small, feature_maps, tmp_path) -> No
     assert torch.equal(narrow.totals, expected.totals)
 
 
-@pytest.mark.parametrize("bad", [{"gate": 0}, {"gate": 1.1}, {"least_weight": -0.1}, {"agreement": -1}])
+@pytest.mark.parametrize(
+    "bad", [{"gate": 0}, {"gate": 1.1}, {"least_weight": -0.1}, {"agreement": -1}, {"agreement": 31}]
+)
 def test_bad_settings_are_refused(bad) -> None:
-    with pytest.raises(ValueError, match=r"shares|negative"):
+    with pytest.raises(ValueError, match=r"shares|0\.\.30"):
         AveragedConfig(**bad)

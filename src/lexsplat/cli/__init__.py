@@ -72,8 +72,10 @@ _UNSUITABLE = {
 }
 """What is wrong with a path, by the numbers of errors of the system."""
 
-_OUT_OF_MEMORY = ("allocate memory", "not enough memory", "out of memory", "could not create a primitive")
-"""What torch says, in a RuntimeError, where Python raises MemoryError; the last is what oneDNN says."""
+_OUT_OF_MEMORY = ("allocate memory", "not enough memory", "out of memory")
+"""What torch says, in a RuntimeError, where Python raises MemoryError."""
+_NO_PRIMITIVE = "could not create a primitive"
+"""All that oneDNN says without memory for its code; it says more where an operation is not supported."""
 
 ALIASES = {"embed": "language"}
 """Other names of commands."""
@@ -109,7 +111,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _discard_output()
         return 0
     except (MemoryError, RuntimeError) as error:
-        out_of_memory = any(phrase in str(error) for phrase in _OUT_OF_MEMORY)
+        said = str(error).strip()
+        out_of_memory = said == _NO_PRIMITIVE or any(phrase in said for phrase in _OUT_OF_MEMORY)
         if not (isinstance(error, MemoryError) or out_of_memory):
             raise
         remedy = "give a smaller --memory, a larger --downscale or a smaller --reconstruction.max-gaussians"

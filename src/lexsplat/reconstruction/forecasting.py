@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 _TOLD_FROM = 1000
 """Fewest iterations with a forecast; the calibration takes as long as about a hundred of them."""
 _FIRST = 24
-"""Steps that are not timed: the first Gaussians are large and faint, and take up to seven times as long."""
+"""Steps that are not timed: the first Gaussians are large and faint, and take two to seven times as long."""
 _STEPS = 4
 _NEIGHBORS = 3
-"""Neighbors whose mean distance is that of a copy from its point, as with the size of the first Gaussians."""
+"""Neighbors whose mean distance is the deviation of a copy from its point along each axis."""
 _GROWTH = {"default": 1.45, "mcmc": 1.05}
 """Factor by which a round of density control multiplies the number of Gaussians; 1.4 to 1.55 on the bundled captures
 with "default", and by definition with "mcmc"."""
@@ -102,7 +102,7 @@ def _counts(config: ReconstructionConfig, start: int, cap: int) -> NDArray[np.fl
 
 
 def _grown(points: InitialPoints, count: int) -> InitialPoints:
-    """As many points as there may be Gaussians: the given ones, and copies about as far away as their neighbors."""
+    """As many points as there may be Gaussians: the given ones, and copies near them."""
     repeats, generator = max(1, -(-count // len(points.points))), np.random.default_rng(0)
     near = min(_NEIGHBORS + 1, len(points.points))
     distances = cKDTree(points.points).query(points.points, k=range(1, near + 1))[0]

@@ -21,7 +21,7 @@ class SparseCellWeights:
     Args:
         tiles: The pairs of the view.
         cells: Cell of each entry ``[E]``.
-        weights: Weight of each entry ``[E]``, positive.
+        weights: Weight of each entry ``[E]``, positive. A cell that crosses a border of tiles has several entries.
         first_entries: First entry of each pair in the list by Gaussian ``[M]``.
         entry_counts: Number of its entries ``[M]``.
     """
@@ -43,11 +43,12 @@ class SparseCellWeights:
         owners[np.repeat(starts, counts) + within] = np.repeat(of_pair[shown], counts)
         return owners
 
-    def largest(self) -> Tensor:
-        """The largest weight of each Gaussian in one cell ``[N]``."""
-        found = np.zeros(self.tiles.count, np.float32)
-        np.maximum.at(found, self.owners(), self.weights)
-        return torch.from_numpy(found)
+    def in_cells(self, owners: NDArray[np.int32]) -> NDArray[np.float64]:
+        """The weight of each entry's Gaussian in its whole cell ``[E]``, of which other tiles may hold a share."""
+        keys = owners.astype(np.int64) * (int(self.cells.max(initial=0)) + 1) + self.cells
+        _, places = np.unique(keys, return_inverse=True)
+        sums = np.bincount(places, self.weights.astype(np.float64)).astype(np.float64)
+        return np.asarray(sums[places])
 
     def totals(self) -> Tensor:
         """Sum of the weights of each Gaussian ``[N]``."""

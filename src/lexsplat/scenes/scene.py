@@ -206,7 +206,7 @@ class Scene:
         texts = self.embed(prompts), self.embed(self.query.compared)
         if not self.query.everyday:
             return Question(*texts, self.query)
-        with self._working:  # before the locks of the classifier's properties, as everywhere
+        with self._working:  # before the locks of the classifier's properties, as in `ask`
             best = self.presence_classifier.best_heights(check_prompts(prompts))
         return Question(*texts, self.query, self.everyday_scale, best)
 

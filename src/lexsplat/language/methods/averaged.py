@@ -19,7 +19,6 @@ at each level, from one codebook. u_G is the mean over the levels.
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -85,8 +84,9 @@ class AveragedConfig:
             never seen, in 0..1.
         squared: Square the weights of the mean.
         agreement: Weigh each feature by exp(agreement (cos - 1)), where cos compares it with the Gaussian's mean over
-            all views, in a second pass over them. 0 takes the mean of the first.
-        reliability: Derive u from the length of the mean; without, u is 0 for all that the views show.
+            all views, in a second pass over them; in 0..30. 0 takes the mean of the first.
+        reliability: Derive u from the length of the mean. Without, u is 0 for all that the views show, and views that
+            disagree are not reported.
     """
 
     top: int = 4
@@ -111,8 +111,8 @@ class AveragedConfig:
             raise ValueError("min_visibility and prior_visibility must not be negative")
         if not 0 < self.gate <= 1 or not 0 <= self.least_weight <= 1:
             raise ValueError("gate and least_weight are shares: above 0 and from 0, at most 1")
-        if not 0 <= self.agreement < math.inf:
-            raise ValueError(f"agreement must not be negative, got {self.agreement:g}")
+        if not 0 <= self.agreement <= 30:  # beyond, weights vanish in float32
+            raise ValueError(f"agreement must be in 0..30, got {self.agreement:g}")
 
     @property
     def weighs_entries(self) -> bool:
@@ -152,7 +152,8 @@ class Averaged:
             tell("language", _forecast(gaussians, views, config, run), amount)
         found = _means(gaussians, views, views.cameras, config, run)
         field = _with_language(gaussians, found, config.codebook, config.averaged, run)
-        _doubt_features(field, found.totals * found.visible(config.averaged))
+        if config.averaged.reliability:
+            _doubt_features(field, found.totals * found.visible(config.averaged))
         return field
 
 

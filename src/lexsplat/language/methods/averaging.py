@@ -118,7 +118,7 @@ def average_features(
         valid: Valid pixels of a view.
         memory: Host memory in bytes, which bounds the sums (`sums_bound`). If they need more, the views are traversed
             several times, for a range of feature dimensions each. Means that need more than the bound of the host are
-            kept in a file. The result does not depend on it.
+            kept in a file; ``config.agreement`` keeps those of both passes. The result does not depend on it.
         scratch: Folder for that file; None takes the system's.
         workers: Workers that sum each shard of views. The result does not depend on them.
         listener: Receives events of stage "average".
@@ -305,8 +305,8 @@ def _shard_sums(shared: _Averaging, item: _Shard) -> tuple[Tensor, Tensor, int]:
             totals[0] += weights.totals()
         if config.weighs_entries:
             entries = cast("SparseCellWeights", weights)  # of Gaussians on the CPU
-            torch.maximum(totals[2], entries.largest(), out=totals[2])
-            weights = lifted(entries, features, shared.means, config)
+            weights, largest = lifted(entries, features, shared.means, config)
+            torch.maximum(totals[2], largest, out=totals[2])
             totals[1] += weights.totals()
         weights.add_to(sums, features[:, columns.start : columns.stop])
     return sums, totals, len(names)

@@ -35,8 +35,8 @@ _ROWS = 16_384
 
 def lifted(
     weights: SparseCellWeights, features: Tensor, means: NDArray[np.float16] | None, config: AveragedConfig
-) -> SparseCellWeights:
-    """The weights by which a view's features enter the sums.
+) -> tuple[SparseCellWeights, Tensor]:
+    """The weights by which a view's features enter the sums, and the largest alpha T of a Gaussian in a cell ``[N]``.
 
     Args:
         weights: The weights alpha T of the view.
@@ -45,13 +45,16 @@ def lifted(
         config: The settings.
     """
     owners, values = weights.owners(), weights.weights.astype(np.float64)
+    in_cells, largest = weights.in_cells(owners), np.zeros(weights.tiles.count)
+    np.maximum.at(largest, owners, in_cells)
     if config.gate < 1:
-        values *= np.where(passes_gate(weights.totals().numpy(), config.gate), 1.0, BESIDE_GATE)[owners]
+        passing = np.where(passes_gate(weights.totals().numpy(), config.gate), 1.0, BESIDE_GATE)[owners]
+        values, in_cells = values * passing, in_cells * passing
     if config.squared:
-        values **= 2
+        values *= in_cells  # the entries of one cell add up to the square of their sum
     if means is not None:
         values *= agreeing(owners, weights.cells, features, means, config.agreement)
-    return replace(weights, weights=values.astype(np.float32))
+    return replace(weights, weights=values.astype(np.float32)), torch.from_numpy(largest.astype(np.float32))
 
 
 def passes_gate(totals: NDArray[np.float32], share: float) -> NDArray[np.bool_]:
