@@ -107,11 +107,11 @@ def _grown(points: InitialPoints, count: int) -> InitialPoints:
     near = min(_NEIGHBORS + 1, len(points.points))
     distances = cKDTree(points.points).query(points.points, k=range(1, near + 1))[0]
     spread = distances.sum(1, keepdims=True) / max(1, near - 1)  # the first is the point itself
-    copies = [spread * generator.standard_normal(points.points.shape) for _ in range(repeats - 1)]
+    offsets = [np.zeros_like(points.points)]
+    offsets += [spread * generator.standard_normal(points.points.shape) for _ in range(repeats - 1)]
+    copies = np.concatenate([points.points + offset for offset in offsets])[:count]
     return replace(
         points,
-        points=np.concatenate([points.points, *(points.points + copy for copy in copies)])[:count].astype(
-            points.points.dtype
-        ),
+        points=copies.astype(points.points.dtype),
         colors=np.concatenate([points.colors] * repeats)[:count],
     )

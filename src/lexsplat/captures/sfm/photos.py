@@ -35,7 +35,7 @@ EXHAUSTIVE_LIMIT = 80
 
 _WORK = ".poses"
 _SETTLED = 10.0
-"""Seconds of matching before its time is told: the first pairs of photos take two to three times as long as later."""
+"""Seconds of matching before its time is told: the first pairs take two to three times as long as later ones."""
 
 
 @dataclass(frozen=True)
