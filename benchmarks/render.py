@@ -9,12 +9,13 @@ For each size, number of Gaussians and number of channels, in milliseconds (best
     blend       the blending part of forward
     naive       the same blending pixel by pixel over the list of its tile, with libm's exp (`per_pixel`)
 
-and the pairs of Gaussian and tile per second of forward time. Three lower bounds, in milliseconds:
+and the pairs of Gaussian and tile per second of forward time. Four lower bounds, in milliseconds:
 
     exps        time of the exponentials of blending: the rows of 16 pixels that Gaussians reach, at the measured
                 rate of a loop of only `alpha_of`; forward and backward each evaluate them once
     bytes       time to move the necessary bytes of forward (`bytes_moved`) at the rate of a copy
     b.bytes     the same of backward (`bytes_of_gradients`)
+    places      time to write each pair into the list of its tile, Gaussian by Gaussian, where all places are known
 """
 
 from __future__ import annotations
@@ -101,6 +102,13 @@ def only_alphas(start, stop, rows, out):
         out[part] = lanes.total(sums)
 
 
+@numba.njit(nogil=True, error_model="numpy", cache=True)
+def only_places(start, stop, owners, places, lists):
+    """Only the last step of any sorting of pairs: each goes to its place in the list of its tile."""
+    for pair in range(start, stop):
+        lists[places[pair]] = owners[pair]
+
+
 def measure(function, repeats: int) -> tuple[float, float]:
     """Best and median wall time in milliseconds after one warm-up call."""
     function()
@@ -184,13 +192,18 @@ def run_case(width: int, height: int, count: int, channels: int, repeats: int) -
         raise SystemExit("the naive port renders another image")
     floor = measure(lambda: parallel(only_alphas, 64, 4, rows_of(pairs), np.empty(64, np.float32)), repeats)
     rate = copy_rate(repeats)
+    by_gaussian = np.argsort(pairs.members, kind="stable").astype(np.int32)
+    places = (pairs.members[by_gaussian], by_gaussian, np.empty_like(pairs.members))
+    placing = measure(lambda: parallel(only_places, len(by_gaussian), 1 << 14, *places), repeats)
+    if not np.array_equal(places[2], pairs.members):
+        raise SystemExit("the pairs are not where their tiles have them")
     return {
         "width": width, "height": height, "gaussians": count, "channels": channels, "pairs": len(pairs.members),
         "forward_ms": forward[0], "forward_median_ms": forward[1],
         "backward_ms": backward_times[0], "backward_median_ms": backward_times[1],
         "blend_ms": blend[0], "naive_ms": naive[0], "ratio": naive[0] / blend[0], "floor_ms": floor[0],
         "bytes_ms": bytes_moved(gaussians, channels, pairs) / rate,
-        "backward_bytes_ms": bytes_of_gradients(gaussians, channels, pairs) / rate,
+        "backward_bytes_ms": bytes_of_gradients(gaussians, channels, pairs) / rate, "places_ms": placing[0],
         "pairs_per_second": len(pairs.members) / forward[0] * 1e3,
     }  # fmt: skip
 
@@ -206,7 +219,7 @@ def main() -> None:
     )
     print(
         f"{'size':>8} {'N':>7} {'C':>3} {'pairs':>8}   {'forward':>14}   {'backward':>14} {'Mpairs/s':>9}"
-        f" {'blend':>7} {'naive':>7} {'ratio':>6} {'exps':>6} {'bytes':>6} {'b.bytes':>7}"
+        f" {'blend':>7} {'naive':>7} {'ratio':>6} {'exps':>6} {'bytes':>6} {'b.bytes':>7} {'places':>6}"
     )
     cases = []
     for width, height in SIZES:
@@ -219,7 +232,8 @@ def main() -> None:
                 print(
                     f"{width:>4}x{height} {count:>7} {channels:>3} {c['pairs']:>8}   {forward:>14}   {backward:>14}"
                     f" {c['pairs_per_second'] / 1e6:>9.1f} {c['blend_ms']:>7.1f} {c['naive_ms']:>7.1f}"
-                    f" {c['ratio']:>6.1f} {c['floor_ms']:>6.1f} {c['bytes_ms']:>6.1f} {c['backward_bytes_ms']:>7.1f}",
+                    f" {c['ratio']:>6.1f} {c['floor_ms']:>6.1f} {c['bytes_ms']:>6.1f} {c['backward_bytes_ms']:>7.1f}"
+                    f" {c['places_ms']:>6.1f}",
                     flush=True,
                 )
     write_record(options.json, cases, threads=options.threads)

@@ -131,7 +131,7 @@ class _WithLanguage(Geometry):
         def joined(reconstructor: Reconstructor) -> JointTrainer:
             return self.method.joined(reconstructor, views, config, config.seed)
 
-        compile_kernels(run.device)
+        compile_kernels(run.device, run.fit.listener)
         tell_time(*start, **options, listener=run.fit.listener, joined=joined)
         training = joined(Reconstructor(*start, **options, seed=config.seed))
         return self.method.fit_geometry(training, run.fit), {"joint": True}

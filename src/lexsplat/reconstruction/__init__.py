@@ -70,7 +70,7 @@ def reconstruct(
     few = has_few_photos(capture)
     if few and points.origin != "random":
         points = points_between(capture, points, seed)
-    compile_kernels(device)
+    compile_kernels(device, listener)
     tell_time(capture, config, points, device=device, memory=memory, listener=listener)
     trainer = Reconstructor(capture, config, points, device=device, seed=seed, memory=memory)
     trainer.run(listener, checkpoint)

@@ -5,18 +5,28 @@ from __future__ import annotations
 import subprocess
 import sys
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.runtime.progress import Event, Listener, silent
+
+STAGE = "kernels"
+KERNELS = 21
+"""Kernels that a training calls. Each takes about a second with those that it calls itself."""
 
 
-def compile_kernels(device: torch.device | str) -> None:
+def compile_kernels(device: torch.device | str, listener: Listener = silent) -> None:
     """Compile the kernels of a training on the CPU that no run has compiled yet; the training loads them then.
 
     Where no other process can be started, the training compiles them itself.
+
+    Args:
+        device: Device of the training.
+        listener: Hears an event of stage "kernels" for each.
     """
     if torch.device(device).type != "cpu":
         return
@@ -26,11 +36,23 @@ def compile_kernels(device: torch.device | str) -> None:
     if marker.exists():
         return
     jit.announce()
+    listener(Event(STAGE, 0, KERNELS))
     with suppress(OSError, TypeError):  # a Python inside another program has no executable
-        # In a folder of ours: Python looks for modules where it starts.
-        done = subprocess.run([sys.executable, "-m", __name__], capture_output=True, cwd=marker.parent)
-        if done.returncode == 0:
+        if _compiled_elsewhere(marker.parent, listener):
             marker.touch()
+    listener(Event(STAGE, KERNELS, KERNELS))
+
+
+def _compiled_elsewhere(folder: Path, listener: Listener) -> bool:
+    """Whether another process has compiled the kernels; it writes a line after each."""
+    # In a folder of ours: Python looks for modules where it starts.
+    command = [sys.executable, "-m", __name__]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=folder
+    ) as process:
+        for done, _ in enumerate(process.stdout or (), 1):
+            listener(Event(STAGE, min(done, KERNELS - 1), KERNELS))
+    return process.returncode == 0
 
 
 def _train_a_little() -> None:
@@ -57,5 +79,12 @@ def _train_a_little() -> None:
         weights.totals()
 
 
-if __name__ == "__main__":
+def _main() -> None:
+    from lexsplat.rendering.kernels import jit
+
+    jit.when_compiled(lambda: print(flush=True))
     _train_a_little()
+
+
+if __name__ == "__main__":
+    _main()

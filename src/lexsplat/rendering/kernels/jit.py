@@ -107,6 +107,27 @@ class _Announcer(event.Listener):
 event.register("numba:compile", _Announcer())
 
 
+class _Compiled(event.Listener):
+    """Tells of each kernel that is compiled because Python calls it, after those that it calls itself."""
+
+    def __init__(self, told: Callable[[], None]) -> None:
+        self._told, self._unfinished = told, 0
+
+    def on_start(self, event: Any) -> None:
+        self._unfinished += event.data["dispatcher"] in _dispatchers
+
+    def on_end(self, event: Any) -> None:
+        if event.data["dispatcher"] in _dispatchers:
+            self._unfinished -= 1
+            if not self._unfinished:
+                self._told()
+
+
+def when_compiled(told: Callable[[], None]) -> None:
+    """Call a function after each kernel that is compiled because Python calls it, in a process of one thread."""
+    event.register("numba:compile", _Compiled(told))
+
+
 _pool: ThreadPoolExecutor | None = None
 
 
