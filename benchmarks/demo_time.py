@@ -2,8 +2,8 @@
 
     python benchmarks/demo_time.py --base d4e65b3 [--repeats 9] [--seeds 0 1 2] [--json FILE]
 
-Whole runs of `lexsplat demo` alternate, each in a fresh folder. One short run of each version before the measured ones
-compiles the kernels. Repeats take turns with the seeds, so that the spread of each quality over them is in the table.
+Whole runs of `lexsplat demo` alternate, each in a fresh folder. One short run of each version before the measured
+ones compiles the kernels. Repeats take turns with the seeds: the table has the spread of each quality over them.
 """
 
 from __future__ import annotations
@@ -96,7 +96,8 @@ def main() -> None:
                 print(f"repeat {repeat} seed {seed} {version}: {clocks}", flush=True)
     rows = [{"version": version, **summary(runs)} for version, runs in found.items()]
     for clock in CLOCKS:
-        print(f"{clock}: {rows[0][clock]:.2f} and {rows[1][clock]:.2f}, ours / base {rows[1][clock] / rows[0][clock]:.2f}")
+        before, today = (row[clock] for row in rows)
+        print(f"{clock}: {before:.2f} and {today:.2f}, ours / base {today / before:.2f}")
     for name in sorted(rows[0]["quality"].keys() & rows[1]["quality"].keys()):
         (before, spread), (today, spread_today) = (row["quality"][name] for row in rows)
         print(f"{name}: {before:.4f} ± {spread:.4f} and {today:.4f} ± {spread_today:.4f}")

@@ -63,12 +63,14 @@ class PosesClock:
 
     def __call__(self, event: Event) -> None:
         now = time.monotonic()
-        if not event.done:
+        if event.stage == "triangulate" and event.done == (event.total - 3) // 2:  # all images are written
+            self._starts["poses"] = now
+        elif not event.done:
             self._starts[event.stage] = now
             if event.stage == "matching" and "poses" in self._starts:
                 self.taken.setdefault("SIFT features", now - self._starts["poses"])
-        elif event.stage == "matching" and event.done == event.total:
-            self.taken["matching"] = now - self._starts["matching"]
+        elif event.stage in ("matching", "mapping") and event.done == event.total:
+            self.taken[event.stage] = now - self._starts[event.stage]
 
 
 def measure(name: str, options: argparse.Namespace) -> list[dict[str, Any]]:

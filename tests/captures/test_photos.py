@@ -1,7 +1,6 @@
 import os
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -22,10 +21,8 @@ from support.written_captures import save
 
 from lexsplat.captures import PoseConfig, load_capture, poses_from_photos
 from lexsplat.captures.sfm import counting, mapping, photos
-from lexsplat.captures.sfm.mapping import Attempt
 from lexsplat.captures.sfm.preparation import find_photos, prepare_photos, turned_upright
 from lexsplat.captures.sfm.pycolmap_import import quiet_pycolmap
-from lexsplat.geometry.cameras import look_at
 from lexsplat.runtime.errors import CaptureError
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("own_size_features")]
@@ -88,17 +85,6 @@ def test_progress_counts_the_pairs_of_photos(room):
     counts = [event.done for event in pairs]
     assert counts == sorted(counts)
     assert (counts[0], counts[-1]) == (0, 45)
-
-
-@pytest.mark.parametrize(("mapper", "shown"), [("global", [0, 1]), ("incremental", [])])
-def test_the_global_mapper_which_reports_nothing_is_shown_while_it_runs(mapper, shown, monkeypatch):
-    events = []
-    monkeypatch.setattr(mapping, "map_photos", lambda *_: None)
-    found = photos._attempt(
-        Path("a.db"), SimpleNamespace(names=("a", "b")), mapper, 0, events.append, all_pairs=False
-    )
-    assert found is None
-    assert [(event.stage, event.done) for event in events] == [("global mapper", done) for done in shown]
 
 
 @pytest.mark.parametrize(("pairs", "number"), [("exhaustive", 45), ("sequential", 25)])
@@ -312,34 +298,6 @@ def test_photos_left_over_by_sequential_matching_are_matched_with_all(tmp_path, 
     )
     views = load_capture(poses.root, images=poses.images, test_every=0).views
     assert_same_up_to_a_similarity([views[f"{index}.png"].camera for index in range(COUNT)], cameras)
-
-
-def test_forward_facing_photos_are_registered_by_a_more_lenient_mapper(tmp_path):
-    """All photos see each point within about 5 degrees; pycolmap starts from 16 and tries 8."""
-    angles = np.linspace(0.0, 0.18, 6)
-    cameras = [
-        look_at([1 + 0.5 * np.cos(a), 0.9, 1 + 0.5 * np.sin(a)], [0.2] * 3, [0, 1, 0], *SIZE, 0.9)
-        for a in angles
-    ]
-    for index, camera in enumerate(cameras):
-        save(tmp_path / "photos" / f"{index}.png", room_photo(camera))
-    poses = poses_from_photos(tmp_path / "photos", tmp_path / "out", PoseConfig(max_features=FEW))
-    assert len(poses.registered) == len(cameras)
-    assert poses.mapper != "incremental"
-    assert f'found by the mapper "{poses.mapper}"' in poses.note
-    views = load_capture(poses.root, images=poses.images, test_every=0).views
-    found = np.stack([views[f"{index}.png"].camera.position for index in range(len(cameras))])
-    steps = np.linalg.norm(np.diff(found, axis=0), axis=1)
-    np.testing.assert_allclose(steps / steps.mean(), 1, atol=0.1)  # the true steps are equal
-
-
-def test_the_model_with_more_photos_wins_and_then_the_one_with_less_error():
-    def attempt(photos: int, error: float) -> Attempt:
-        model = SimpleNamespace(num_reg_images=lambda: photos, compute_mean_reprojection_error=lambda: error)
-        return Attempt("incremental", model, 1)
-
-    attempts = [attempt(24, 0.2), attempt(25, 0.7), attempt(25, 0.6)]
-    assert max(attempts, key=lambda each: each.rank) is attempts[2]
 
 
 def test_a_mask_of_another_aspect_is_refused_before_any_work(tmp_path):

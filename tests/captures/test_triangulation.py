@@ -76,6 +76,19 @@ def test_triangulated_points_have_the_colors_of_the_wall(triangulated):
     assert right < 0.4 * wrong
 
 
+def test_the_time_of_features_and_matching_is_told_from_their_first_units(wall, monkeypatch):
+    counts: dict[str, list[tuple[int, int]]] = {}
+
+    def counted(stage: str, units: str, enough: float = 1.0):
+        found = counts.setdefault(stage, [])
+        return lambda done, total: found.append((done, total))
+
+    monkeypatch.setattr(triangulation, "FirstUnits", counted)
+    triangulate(wall)
+    assert counts["SIFT features"] == [(0, 6), (6, 6)], "one batch"
+    assert (counts["matching"][0], counts["matching"][-1]) == ((0, 15), (15, 15))
+
+
 def test_triangulation_reports_progress_and_is_deterministic(wall, triangulated):
     positions, colors, _, events = triangulated
     assert {event.stage for event in events} == {"triangulate", "matching"}

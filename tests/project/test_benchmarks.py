@@ -315,11 +315,19 @@ def test_the_parts_of_structure_from_motion_are_timed_by_their_events(monkeypatc
     clock = forecasts.PosesClock()
     for at, stage, done, total in (
         (0, "poses", 0, 21), (20, "poses", 10, 21), (21, "matching", 0, 45), (60, "matching", 45, 45),
-        (61, "poses", 11, 21), (90, "poses", 21, 21),
+        (61, "mapping", 0, 10), (62, "poses", 12, 21), (85, "mapping", 10, 10), (90, "poses", 21, 21),
     ):  # fmt: skip
         now[0] = float(at)
         clock(Event(stage, done, total))
-    assert clock.taken == {"SIFT features": 21.0, "matching": 39.0}
+    assert clock.taken == {"SIFT features": 21.0, "matching": 39.0, "mapping": 24.0}
+    clock = forecasts.PosesClock()
+    for at, stage, done, total in (
+        (0, "triangulate", 0, 23), (5, "triangulate", 10, 23), (15, "triangulate", 20, 23), (16, "matching", 0, 45),
+        (30, "matching", 45, 45), (35, "triangulate", 23, 23),
+    ):  # fmt: skip
+        now[0] = float(at)
+        clock(Event(stage, done, total))
+    assert clock.taken == {"SIFT features": 11.0, "matching": 14.0}, "without the time of writing the images"
 
 
 def test_opensplat_is_fetched_once_built_and_skipped_with_the_reason(monkeypatch, tmp_path):

@@ -114,4 +114,4 @@ def test_a_training_on_a_gpu_compiles_no_kernels_of_the_cpu(nothing_compiled, mo
     started, events = Started(), []
     monkeypatch.setattr(subprocess, "Popen", started)
     first_run.compile_kernels("cuda", events.append)
-    assert not started and not events
+    assert (started, events) == ([], [])

@@ -37,6 +37,15 @@ def test_the_first_units_tell_the_time_of_all_once(clock, caplog):
     assert caplog.messages[1:] == ["matching: about 41:40 min for 100 pairs"]
 
 
+def test_a_share_of_the_units_can_be_asked_for_before_the_time_is_told(clock, caplog):
+    told = FirstUnits("mapping", "photos", share=0.2)
+    with caplog.at_level(NOTE, "lexsplat"):
+        for done in range(8):
+            told(done, 30)
+            clock[0] += 10.0 if done < 6 else 1.0
+    assert caplog.messages == ["mapping: about 5:00 min for 30 photos"], "six photos in a minute"
+
+
 def test_nothing_is_told_when_half_is_done_before_a_second_has_passed(clock, caplog):
     told = FirstUnits("matching", "pairs")
     with caplog.at_level(NOTE, "lexsplat"):

@@ -47,9 +47,7 @@ def _compiled_elsewhere(folder: Path, listener: Listener) -> bool:
     """Whether another process has compiled the kernels; it writes a line after each."""
     # In a folder of ours: Python looks for modules where it starts.
     command = [sys.executable, "-m", __name__]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=folder
-    ) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=folder) as process:
         for done, _ in enumerate(process.stdout or (), 1):
             listener(Event(STAGE, min(done, KERNELS - 1), KERNELS))
     return process.returncode == 0

@@ -125,10 +125,11 @@ class FirstUnits:
         stage: Name of the stage.
         units: Plural of the unit, such as "photos".
         enough: Seconds that are measured, at least; more where the first units take longer than others.
+        share: Share of the units that is measured, at least.
     """
 
-    def __init__(self, stage: str, units: str, enough: float = 1.0) -> None:
-        self._stage, self._units, self._enough = stage, units, enough
+    def __init__(self, stage: str, units: str, enough: float = 1.0, share: float = 0.0) -> None:
+        self._stage, self._units, self._enough, self._share = stage, units, enough, share
         self._start, self._told = 0.0, False
 
     def __call__(self, done: int, total: int) -> None:
@@ -136,7 +137,8 @@ class FirstUnits:
         if not done:
             self._start, self._told = time.monotonic(), False
         seconds = time.monotonic() - self._start
-        if seconds >= self._enough and 0 < done <= total / 2 and not self._told:
+        measured = seconds >= self._enough and done >= self._share * total
+        if measured and 0 < done <= total / 2 and not self._told:
             self._told = True
             tell(self._stage, seconds / done * total, f"{total:,} {self._units}")
 

@@ -21,13 +21,13 @@ from PIL import Image
 from lexsplat.captures.capture import Capture, View
 from lexsplat.captures.readers.camera_files import MAX_COORDINATE
 from lexsplat.captures.sfm.feature_budget import check_mapping
-from lexsplat.captures.sfm.photos import MATCHING, PoseConfig
+from lexsplat.captures.sfm.photos import MATCHING, SETTLED, SIFT, PoseConfig
 from lexsplat.captures.sfm.preparation import PreparedPhotos
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import CaptureError, FileFormatError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import file_stamp, fingerprint
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Event, FirstUnits, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.captures.sfm.pycolmap_import import pycolmap
@@ -275,21 +275,26 @@ def _run_pycolmap(
     def report(done: int) -> None:
         listener(Event(STAGE, done, 2 * len(views) + 3))
 
+    tell_features, tell_pairs = FirstUnits(SIFT, "images"), FirstUnits(MATCHING, "pairs", SETTLED)
+
+    def report_features(done: int) -> None:
+        report(len(views) + done)
+        tell_features(done, len(views))
+
     def report_pairs(done: int, pairs: int) -> None:
         listener(Event(MATCHING, done, pairs))
+        tell_pairs(done, pairs)
 
     names = tuple(_file_name(index) for index in range(len(views)))
     for done, (view, name) in enumerate(zip(views, names)):
         report(done)
         _write_photo(view, folder, name)
-    report(len(views))
+    report_features(0)
     database, images, masks = folder / "database.db", folder / "images", folder / "masks"
     largest = max(map(_working_size, views), key=lambda size: size[0] * size[1])
     lenses = tuple((name,) for name in names)
     photos = PreparedPhotos(images, names, lenses, masks if masks.is_dir() else None, largest)
-    mapping.extract_features(
-        database, photos, FEATURES, memory, lambda done: report(len(views) + done), camera_model="PINHOLE"
-    )
+    mapping.extract_features(database, photos, FEATURES, memory, report_features, camera_model="PINHOLE")
     known = _known_reconstruction(database, views)
     report(2 * len(views))
     pairs = [(names[first], names[second]) for first, second in matching_pairs(views)]
