@@ -37,7 +37,7 @@ _WORK = ".poses"
 SETTLED = 10.0
 """Seconds of matching before its time is told: the first pairs take two to three times as long as later ones."""
 _TOLD_AT = 0.25
-"""Share of the photos whose registration tells the time of all: .73 to 1.18 of it is taken, and .42 to 1.32 at a tenth."""
+"""Share of photos whose registration tells the time of all: .73 to 1.18 of it is taken, .42 to 1.32 at a tenth."""
 
 
 @dataclass(frozen=True)
