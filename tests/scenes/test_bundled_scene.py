@@ -23,7 +23,8 @@ from lexsplat.runtime.errors import ModelError, SceneFolderError
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.records import read_record
 from lexsplat.scenes.scene import Scene
-from lexsplat.scenes.words import Word, of_part
+from lexsplat.scenes.serving import OpenScene
+from lexsplat.scenes.words import Word, of_part, things_with_parts
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +106,17 @@ def test_a_part_without_its_thing_is_that_of_the_object_that_has_it(demo, alone,
     assert demo.find(alone).note == f"the {alone} of the {thing}"
     assert torch.equal(demo.find(alone).mask, demo.find(whole).mask)
     assert torch.equal(demo.ask(f"the {alone}").scores, found.scores)
+
+
+def test_the_first_question_about_a_part_searches_no_neighbors_in_a_warm_process():
+    served = OpenScene("demo")
+    served.warm()
+    scene, things = served.scene, things_with_parts(served.scene)
+    assert {"mug", "teddy bear", "toy car"} < set(things)
+    assert not {"table", "wall", "floor"} & set(things)
+    assert len(scene.graphs) == len(things)
+    assert scene.ask(["mug handle", "bear nose", "car wheels"]).presences == ("yes", "yes", "yes")
+    assert len(scene.graphs) == len(things)
 
 
 def test_a_part_that_several_objects_have_is_that_of_each(demo):

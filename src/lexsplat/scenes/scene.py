@@ -59,7 +59,7 @@ from lexsplat.scenes.kept import KeptObjects, kept_objects_of, seen_of
 from lexsplat.scenes.objects import objects_of
 from lexsplat.scenes.reading import read_scene
 from lexsplat.scenes.views import StoredView, view_named
-from lexsplat.scenes.words import Word, new_words
+from lexsplat.scenes.words import KEPT_GRAPHS, Word, new_words
 
 _KEPT_BYTES = 128 << 20
 """Memory for the scores and selections of words that were asked, at most; 32 words are kept in any case."""
@@ -109,7 +109,7 @@ class Scene:
             own, common = (root / "checkpoints" / "texts" for root in (folder.root, BUNDLED_SCENE))
             self._cache = texts_of_scene(own, shipped=folder.is_bundled, common=common)
         self._texts: Bounded[str, Tensor] = Bounded(_KEPT_TEXTS)
-        self.graphs: Bounded[str, ThingGraph] = Bounded(16)  # of things whose parts were asked for
+        self.graphs: Bounded[str, ThingGraph] = Bounded(KEPT_GRAPHS)  # of things whose parts were asked for
 
     def __repr__(self) -> str:
         place = f", folder={str(self.folder.root)!r}" if self.folder else ""

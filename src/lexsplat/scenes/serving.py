@@ -20,6 +20,7 @@ from lexsplat.runtime.progress import Listener, silent, uncounted
 from lexsplat.scenes.answers import find_phrase
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.scene import Scene, open_scene
+from lexsplat.scenes.words import prepare_parts, things_with_parts
 
 log = logging.getLogger("lexsplat")
 
@@ -56,12 +57,15 @@ class OpenScene:
         return scene
 
     def warm(self) -> None:
-        """Load and compute what the first questions would wait for: the encoder, the dictionary, the objects."""
+        """Load and compute what the first questions would wait for: encoder, dictionary, objects and their graphs."""
         with contextlib.suppress(LexsplatError):  # the first question reports it
             scene = self.scene
             scene.preload()
             corrected("thing", ())
             scene.find("where is the thing?")
+            for name in things_with_parts(scene):
+                prepare_parts(scene, name)
+            scene.find("where is the handle?")
 
     @property
     def scene(self) -> Scene:

@@ -42,8 +42,8 @@ _PIECE = 0.3
 """Share of an object of its name from which a word is that object."""
 _PER_THREAD = 100_000
 """Gaussians for each thread of torch: with fewer, waiting for each other costs more than it saves."""
-_KEPT_GRAPH = 20_000
-"""Gaussians of the largest thing whose graph is kept: it takes about 200 bytes for each."""
+KEPT_GRAPHS, _KEPT_GRAPH = 16, 20_000
+"""Graphs of things that are kept, and Gaussians of the largest of them: a graph takes about 200 bytes for each."""
 
 
 @dataclass(eq=False)
@@ -169,14 +169,34 @@ def of_part(scene: Scene, prompt: str, word: Word) -> Word:
     name = thing_of_part(prompt)
     if not name:
         return word
-    found = scene.ask(name, checked=True)
-    thing = found.chosen(0)
-    if found.presences[0] == "no" or int(thing.sum()) < FEWEST:
+    thing = _thing(scene, name)
+    if thing is None:
         return word
     thing = with_parts(thing, taken, scene.gaussians, segments.labels)
     scores = part_scores(word.own, _graph_of(scene, thing, segments.masses))
     word = word if scores is None else replace(word, scores=scores)
     return replace(word, presence="unsure", note=DOUBTFUL) if _is_doubtful(scene, prompt, word) else word
+
+
+def _thing(scene: Scene, name: str) -> Tensor | None:
+    """The Gaussians that the name of a thing selects ``[N]`` bool; None if they have no parts that can be cut."""
+    found = scene.ask(name, checked=True)
+    thing = found.chosen(0)
+    return None if found.presences[0] == "no" or int(thing.sum()) < FEWEST else thing
+
+
+def things_with_parts(scene: Scene) -> list[str]:
+    """Names of the objects whose graphs are kept together: as many as fit, the largest first, and no surfaces."""
+    if not scene.field.segments or form_used(scene.field, scene.query) != "segment":
+        return []
+    return [each.phrase for each in scene.objects if each.phrase not in SURFACES][:KEPT_GRAPHS]
+
+
+def prepare_parts(scene: Scene, name: str) -> None:
+    """Make the graph of a thing, so that the first question about a part of it is answered as soon as the next."""
+    thing, segments = _thing(scene, name), scene.field.segments
+    if segments and thing is not None and int(thing.sum()) <= _KEPT_GRAPH:
+        _graph_of(scene, thing, segments.masses)
 
 
 def _graph_of(scene: Scene, thing: Tensor, masses: Tensor) -> ThingGraph:

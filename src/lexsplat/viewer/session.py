@@ -32,6 +32,7 @@ from lexsplat.scenes.publishing.splat_file import most_visible, write_splats
 from lexsplat.scenes.publishing.vocabulary import NAME, page_phrases, words_file
 from lexsplat.scenes.publishing.writing import MOST_SPLATS
 from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.words import prepare_parts, things_with_parts
 from lexsplat.viewer.coloring import MODES, colors_in
 from lexsplat.viewer.history import History
 from lexsplat.viewer.requests import Asked, number, vector
@@ -89,7 +90,7 @@ class Session:
         return self.editor.scene
 
     def warm_up(self) -> None:
-        """Load the text encoder and embed what every answer needs, so that the first one is fast."""
+        """Load the text encoder and make what every answer needs, so that the first one is fast."""
         try:
             for phrase in [*self.scene.query.compared, *self.history.vocabulary, *everyday_words()]:
                 if self.closed:
@@ -97,6 +98,11 @@ class Session:
                 with self.lock:  # one phrase at a time, so that a prompt waits for one phrase at most
                     self.scene.preload()
                     self.scene.embed([phrase])
+            for name in things_with_parts(self.scene):
+                if self.closed:
+                    return
+                with self.lock:
+                    prepare_parts(self.scene, name)
         except LexsplatError as error:  # the first question reports it to the page
             logging.getLogger("lexsplat").warning("%s", error)
 
