@@ -68,13 +68,16 @@ class Started(list):
 
     def __init__(self, status: int = 0) -> None:
         super().__init__()
-        self.returncode = status
+        self.returncode, self.killed = status, False
 
     def __call__(self, command: list[str], **options: object) -> "Started":
         self.append(command)
         if self.returncode < 0:
             raise PermissionError(command[0])
         return self
+
+    def kill(self) -> None:
+        self.killed = True
 
     def __enter__(self) -> "Started":
         return self
@@ -108,6 +111,20 @@ def test_each_compiled_kernel_moves_the_bar_and_its_end_is_told_in_any_case(
     first_run.compile_kernels("cpu", events.append)
     kernels = first_run.KERNELS
     assert events == [Event("kernels", done, kernels) for done in (0, *between, kernels)]
+
+
+def test_the_other_process_ends_when_this_one_is_interrupted(nothing_compiled, monkeypatch):
+    started = Started()
+    monkeypatch.setattr(subprocess, "Popen", started)
+
+    def interrupt(event: Event) -> None:
+        if event.done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        first_run.compile_kernels("cpu", interrupt)
+    assert started.killed
+    assert not jit.marker_of("training").exists()
 
 
 def test_a_training_on_a_gpu_compiles_no_kernels_of_the_cpu(nothing_compiled, monkeypatch):

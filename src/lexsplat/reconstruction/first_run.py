@@ -48,8 +48,12 @@ def _compiled_elsewhere(folder: Path, listener: Listener) -> bool:
     # In a folder of ours: Python looks for modules where it starts.
     command = [sys.executable, "-m", __name__]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=folder) as process:
-        for done, _ in enumerate(process.stdout or (), 1):
-            listener(Event(STAGE, min(done, KERNELS - 1), KERNELS))
+        try:
+            for done, _ in enumerate(process.stdout or (), 1):
+                listener(Event(STAGE, min(done, KERNELS - 1), KERNELS))
+        except BaseException:  # such as Ctrl-C, which need not reach the other process
+            process.kill()
+            raise
     return process.returncode == 0
 
 
