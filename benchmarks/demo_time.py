@@ -2,13 +2,15 @@
 
     python benchmarks/demo_time.py --base d4e65b3 [--repeats 9] [--seeds 0 1 2] [--json FILE]
 
-Whole runs of `lexsplat demo` alternate, each in a fresh folder. One short run of each version before the measured
-ones compiles the kernels. Repeats take turns with the seeds: the table has the spread of each quality over them.
+Whole runs of `lexsplat demo` alternate, each in a fresh folder, and so does which version runs first. One short run
+of each before the measured ones compiles the kernels. Repeats take turns with the seeds: the table has the spread of
+each quality over them.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import statistics
 import subprocess
@@ -38,9 +40,10 @@ def run(source: Path, seed: int, steps: int | None = None) -> dict[str, Any]:
             stderr=subprocess.DEVNULL,
         )
         _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
         wall = time.perf_counter() - start
-        if status:
-            raise SystemExit(f"the demo of {source} ended with status {os.waitstatus_to_exitcode(status)}")
+        if process.returncode:
+            raise SystemExit(f"the demo of {source} ended with status {process.returncode}")
         content = json.loads(next(Path(folder).rglob("metrics.json")).read_text())
     return {
         "wall": wall,
@@ -63,12 +66,15 @@ def numbers(content: Mapping[str, Any], within: str = "", depth: int = 3) -> dic
 
 
 def summary(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Median of each clock, and mean and deviation over the seeds of each quality, equal runs of a seed once."""
-    by_seed = {each["seed"]: each["quality"] for each in runs}
+    """Median of each clock, and mean and deviation over the seeds of each quality; runs of a seed are equal."""
+    by_seed: dict[int, Mapping[str, float]] = {}
+    for each in runs:
+        if by_seed.setdefault(each["seed"], each["quality"]) != each["quality"]:
+            print(f"seed {each['seed']}: two runs differ; the first counts", file=sys.stderr)
     quality = {}
     for name in next(iter(by_seed.values())):
         values = [each[name] for each in by_seed.values() if name in each]
-        quality[name] = [statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else 0.0]
+        quality[name] = [statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else math.nan]
     return {
         **{clock: statistics.median(each[clock] for each in runs) for clock in CLOCKS},
         "quality": quality,
@@ -89,7 +95,7 @@ def main() -> None:
             run(source, 0, steps=20)
         for repeat in range(options.repeats):
             seed = options.seeds[repeat % len(options.seeds)]
-            for version, source in sources.items():
+            for version, source in list(sources.items())[:: 1 if repeat % 2 == 0 else -1]:
                 row = {"seed": seed, **run(source, seed)}
                 found[version].append(row)
                 clocks = ", ".join(f"{clock} {row[clock]:.2f}" for clock in CLOCKS)

@@ -6,8 +6,9 @@
 Builds each capture in a folder of its own and compares what the build says before a stage with what the stage took
 by the clock. "ratio" is taken / told; the goal is 0.67 to 1.5. "-" is a stage whose time nothing tells. Times of a
 machine that does other work meanwhile differ by what that work takes: --processor compares processor seconds of one
-thread (with OMP_NUM_THREADS=1) in place of the clock; then reading files costs nothing. SIFT features and matching of
-photos without cameras are told after their first units; they are timed from the first to the last event of progress.
+thread (with OMP_NUM_THREADS=1) in place of the clock; then reading files costs nothing. SIFT features,
+matching and mapping are told after their first units; they are timed from the first to the last event of progress,
+the mapping from that of the last mapper that was tried.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class PosesClock:
     def __call__(self, event: Event) -> None:
         now = time.monotonic()
         if event.stage == "triangulate" and event.done == (event.total - 3) // 2:  # all images are written
-            self._starts["poses"] = now
+            self._starts["poses"] = now  # where the features begin, as in `poses`
         elif not event.done:
             self._starts[event.stage] = now
             if event.stage == "matching" and "poses" in self._starts:

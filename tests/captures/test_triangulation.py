@@ -76,7 +76,7 @@ def test_triangulated_points_have_the_colors_of_the_wall(triangulated):
     assert right < 0.4 * wrong
 
 
-def test_the_time_of_features_and_matching_is_told_from_their_first_units(wall, monkeypatch):
+def test_the_units_of_features_and_matching_are_counted_for_their_forecasts(wall, monkeypatch):
     counts: dict[str, list[tuple[int, int]]] = {}
 
     def counted(stage: str, units: str, enough: float = 1.0):

@@ -330,6 +330,27 @@ def test_the_parts_of_structure_from_motion_are_timed_by_their_events(monkeypatc
     assert clock.taken == {"SIFT features": 11.0, "matching": 14.0}, "without the time of writing the images"
 
 
+def test_the_demo_is_summed_up_by_medians_of_clocks_and_the_spread_of_quality_over_seeds(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import demo_time
+
+    content = {
+        "quality": {"psnr": 31.0, "lpips": None, "per_view": {"a": 1.0}},
+        "language": {"strict": {"mAP": 0.9}},
+    }
+    assert demo_time.numbers(content) == {"quality.psnr": 31.0, "language.strict.mAP": 0.9}
+    runs = [
+        {"seed": seed, "wall": wall, "processor": 2 * wall, "peak_gb": 1.0, "quality": {"psnr": psnr}}
+        for seed, wall, psnr in ((0, 10.0, 30.0), (1, 40.0, 32.0), (0, 20.0, 30.0))
+    ]
+    found = demo_time.summary(runs)
+    assert (found["wall"], found["processor"]) == (20.0, 40.0)
+    assert found["quality"]["psnr"] == pytest.approx([31.0, 2**0.5])
+    assert not capsys.readouterr().err
+    demo_time.summary([*runs, {**runs[0], "quality": {"psnr": 30.5}}])
+    assert "seed 0: two runs differ" in capsys.readouterr().err
+
+
 def test_opensplat_is_fetched_once_built_and_skipped_with_the_reason(monkeypatch, tmp_path):
     import opensplat
 

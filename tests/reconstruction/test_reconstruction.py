@@ -121,8 +121,9 @@ def test_events_count_up_to_the_end(capture):
     reconstruct(
         capture, dataclasses.replace(SHORT, iterations=25, reset_opacities=False), listener=events.append
     )
+    events = [event for event in events if event.stage != "kernels"]  # of the first training on a machine
     assert [event.done for event in events] == [0, 10, 20, 25]
-    assert {event.stage for event in events} - {"kernels"} == {"reconstruct"}
+    assert {event.stage for event in events} == {"reconstruct"}
     assert all(event.total == 25 for event in events)
     assert all(event.metrics["gaussians"] > 0 for event in events[1:])
     assert all(5 < event.metrics["psnr"] < 50 for event in events[1:])

@@ -2,6 +2,7 @@
 
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 
 import numba
 import numpy as np
@@ -93,7 +94,7 @@ def test_only_compilation_of_this_packages_kernels_is_announced_once(monkeypatch
             fresh = jit.kernel(image_loss_kernels._multiply.py_func)
             fresh._cache = NullCache()
             fresh(0, 2, image, image, products)
-    assert [record.message for record in caplog.records] == ["compiling CPU kernels, once (about 15 seconds)"]
+    assert [record.message for record in caplog.records] == ["compiling CPU kernels, once (about 20 seconds)"]
 
 
 def test_a_read_only_installation_caches_kernels_in_the_home_folder(tmp_path, monkeypatch):
@@ -133,3 +134,21 @@ def test_without_a_writable_folder_kernels_go_to_a_temporary_folder(tmp_path, mo
         monkeypatch.setattr(Path, "expanduser", no_home)
     folder = jit._cache_folder.__wrapped__()
     assert folder == str(tmp_path / "lexsplat-kernels-")
+
+
+def test_a_kernel_is_told_once_all_that_it_calls_itself_are_compiled():
+    from lexsplat.rendering.kernels import binning, jit
+
+    outer, inner = binning.find_boxes, binning.list_pairs
+    of_others = object()
+    told: list[str] = []
+    listener = jit._Compiled(lambda: told.append("compiled"))
+
+    def event(dispatcher: object) -> SimpleNamespace:
+        return SimpleNamespace(data={"dispatcher": dispatcher})
+
+    for dispatcher in (of_others, outer, inner):
+        listener.on_start(event(dispatcher))
+    for dispatcher, expected in ((inner, 0), (outer, 1), (of_others, 1)):
+        listener.on_end(event(dispatcher))
+        assert len(told) == expected

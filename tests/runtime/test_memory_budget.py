@@ -29,9 +29,9 @@ from lexsplat.runtime.errors import MemoryBudgetError
 pytestmark = pytest.mark.slow
 
 MEGABYTE = 1 << 20
-VIEWS, WIDTH, HEIGHT = 46, 720, 540
+VIEWS, WIDTH, HEIGHT = 50, 720, 540
 MEMORY = 45 * MEGABYTE
-BESIDE = 145 * MEGABYTE
+BESIDE = 160 * MEGABYTE
 """What one photo on its way, a few hundred Gaussians and threads may take beside the budget."""
 
 BUILD = """

@@ -56,7 +56,8 @@ def reconstruct(
         memory: Budget of host memory in bytes, for the triangulation and then for Gaussians and photos.
         checkpoint: Checkpoint to save to on the way and to resume from.
         listener: Receives an event of stage "reconstruct" every ten iterations, with "psnr" (recent training
-            views, dB) and "gaussians" (their number).
+            views, dB) and "gaussians" (their number); before, events of the stages "triangulate", "matching",
+            "kernels" and "calibrate", where there is such work.
 
     Raises:
         TrainingError: If there is nothing to train on, or the training diverges.

@@ -37,8 +37,8 @@ def compile_kernels(device: torch.device | str, listener: Listener = silent) -> 
         return
     jit.announce()
     listener(Event(STAGE, 0, KERNELS))
-    with suppress(OSError, TypeError):  # a Python inside another program has no executable
-        if _compiled_elsewhere(marker.parent, listener):
+    if _compiled_elsewhere(marker.parent, listener):
+        with suppress(OSError):  # the next training asks again
             marker.touch()
     listener(Event(STAGE, KERNELS, KERNELS))
 
@@ -47,7 +47,11 @@ def _compiled_elsewhere(folder: Path, listener: Listener) -> bool:
     """Whether another process has compiled the kernels; it writes a line after each."""
     # In a folder of ours: Python looks for modules where it starts.
     command = [sys.executable, "-m", __name__]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=folder) as process:
+    try:
+        started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=folder)
+    except (OSError, TypeError):  # a Python inside another program has no executable
+        return False
+    with started as process:
         try:
             for done, _ in enumerate(process.stdout or (), 1):
                 listener(Event(STAGE, min(done, KERNELS - 1), KERNELS))

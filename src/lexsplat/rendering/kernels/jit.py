@@ -90,7 +90,7 @@ def announce() -> None:
     global _announced
     if not _announced:
         _announced = True
-        logger.log(NOTE, "compiling CPU kernels, once (about 15 seconds)")
+        logger.log(NOTE, "compiling CPU kernels, once (about 20 seconds)")
 
 
 class _Announcer(event.Listener):
