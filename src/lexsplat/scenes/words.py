@@ -169,7 +169,7 @@ def of_part(scene: Scene, prompt: str, word: Word) -> Word:
     name = thing_of_part(prompt)
     if not name:
         return word
-    thing = _thing(scene, name)
+    thing = _thing_named(scene, name)
     if thing is None:
         return word
     thing = with_parts(thing, taken, scene.gaussians, segments.labels)
@@ -178,7 +178,7 @@ def of_part(scene: Scene, prompt: str, word: Word) -> Word:
     return replace(word, presence="unsure", note=DOUBTFUL) if _is_doubtful(scene, prompt, word) else word
 
 
-def _thing(scene: Scene, name: str) -> Tensor | None:
+def _thing_named(scene: Scene, name: str) -> Tensor | None:
     """The Gaussians that the name of a thing selects ``[N]`` bool; None if they have no parts that can be cut."""
     found = scene.ask(name, checked=True)
     thing = found.chosen(0)
@@ -194,7 +194,7 @@ def things_with_parts(scene: Scene) -> list[str]:
 
 def prepare_parts(scene: Scene, name: str) -> None:
     """Make the graph of a thing, so that the first question about a part of it is answered as soon as the next."""
-    thing, segments = _thing(scene, name), scene.field.segments
+    thing, segments = _thing_named(scene, name), scene.field.segments
     if segments and thing is not None and int(thing.sum()) <= _KEPT_GRAPH:
         _graph_of(scene, thing, segments.masses)
 

@@ -35,9 +35,9 @@ EXHAUSTIVE_LIMIT = 80
 
 _WORK = ".poses"
 SETTLED = 10.0
-"""Seconds of matching before its time is told: the first pairs take two to three times as long as later ones."""
+"""Seconds of matching before its forecast: the first pairs take two to three times as long as later ones."""
 _TOLD_AT = 0.25
-"""Share of photos whose registration tells the time of all: .85 to 1.25 of it is taken, .63 to 1.58 at a tenth."""
+"""Share of photos registered before the forecast: .85 to 1.25 of it is taken, .63 to 1.58 of one at a tenth."""
 
 
 @dataclass(frozen=True)
