@@ -56,7 +56,7 @@ class EncodersCommand:
             from lexsplat.features.estimate import estimate
             from lexsplat.features.hub import model_folder
             from lexsplat.pipeline.config import BuildConfig
-            from lexsplat.pipeline.encoding import Encoders
+            from lexsplat.pipeline.encoding import Encoders, may_leave_photos_out
             from lexsplat.pipeline.inputs import count_photos
             from lexsplat.runtime.device import choose_device
 
@@ -103,7 +103,8 @@ class EncodersCommand:
                         f"{name.replace('_', ' ')} {_short(value)}" for name, value in facts[tower].items()
                     )
                 )
-        print(f"features on {config.encoder_device}: {found.describe(photos)}")
+        described = found.describe(photos, at_most=photos > 1 and may_leave_photos_out(config))
+        print(f"features on {config.encoder_device}: {described}")
 
 
 def _place(capture: str) -> Any:

@@ -12,7 +12,12 @@ from lexsplat.runtime.lazy import at_first_use
 
 if TYPE_CHECKING:
     from lexsplat.features.cache import FeatureMap, FeatureMaps
-    from lexsplat.features.external import check_external_features, external_identity, load_external_features
+    from lexsplat.features.external import (
+        check_external_features,
+        external_identity,
+        load_external_features,
+        read_external_features,
+    )
     from lexsplat.features.extraction import extract_features, load_level_maps
     from lexsplat.features.settings import FeatureConfig
     from lexsplat.features.text import TextCache
@@ -27,13 +32,19 @@ __all__ = [
     "extract_features",
     "load_external_features",
     "load_level_maps",
+    "read_external_features",
 ]
 
 __getattr__ = at_first_use(
     "lexsplat.features",
     {
         "cache": ("FeatureMap", "FeatureMaps"),
-        "external": ("check_external_features", "external_identity", "load_external_features"),
+        "external": (
+            "check_external_features",
+            "external_identity",
+            "load_external_features",
+            "read_external_features",
+        ),
         "extraction": ("extract_features", "load_level_maps"),
         "settings": ("FeatureConfig",),
         "text": ("TextCache",),

@@ -35,13 +35,14 @@ class Estimate:
     crops: int
     seconds: float
 
-    def describe(self, photos: int) -> str:
-        """One line with the time of one photo and of several."""
+    def describe(self, photos: int, *, at_most: bool = False) -> str:
+        """One line with the time of one photo and of several, which may be more than are read."""
         each = f"{self.seconds:.1f} s" if self.seconds < 60 else f"{self.seconds / 60:.1f} min"
         seconds = self.seconds * photos
         total = duration(seconds) if seconds >= SHORTEST_FORECAST else f"{seconds:.1f} s"
         what = "training photo" if photos == 1 else "training photos"
-        return f"{self.crops:,} crops and about {each} a photo; {total} for {photos:,} {what}"
+        limit = "at most " if at_most else ""
+        return f"{self.crops:,} crops and about {each} a photo; {limit}{total} for {photos:,} {what}"
 
 
 def estimate(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import tokenize
 import zipfile
 from pathlib import Path
@@ -16,9 +17,12 @@ from lexsplat.runtime import memory as budget
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import PICKLES, refuse_pickle
 from lexsplat.runtime.fingerprints import file_stamp
+from lexsplat.runtime.progress import Event, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, View
+
+log = logging.getLogger("lexsplat")
 
 _FLOATS = ("F64", "F32", "F16", "BF16")
 
@@ -101,6 +105,28 @@ def check_external_features(folder: Path, capture: Capture, dimension: int | Non
             shape = _open_features(path).shape
             reading.check_aspect(shape, path)
             _check_depth(shape[-1], dimension, path)
+
+
+def read_external_features(maps: FeatureMaps, folder: Path, listener: Listener = silent) -> None:
+    """Read every map once, which checks it; a warning counts photos without segments.
+
+    Args:
+        maps: From `load_external_features`.
+        folder: Their folder.
+        listener: Receives events of stage "features".
+
+    Raises:
+        FileFormatError: If no photo has a segment, or a file is damaged.
+    """
+    empty = 0
+    for done, name in enumerate(maps, start=1):
+        empty += not bool(maps[name].clip.any())
+        listener(Event("features", done, len(maps)))
+    if empty == len(maps):
+        expected, found = "segments in some photo", "none in any"
+        raise FileFormatError(folder, expected=expected, found=found, remedy="write them again")
+    if empty:
+        log.warning("%s: %d of %d photos have no segment, and so no features", folder, empty, len(maps))
 
 
 def _check_depth(found: int, dimension: int | None, path: Path) -> None:

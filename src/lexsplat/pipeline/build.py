@@ -11,13 +11,14 @@ import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from shlex import quote
 from typing import Any
 
 from lexsplat.captures import Capture, View, load_annotations
 from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook, tell_codebook
-from lexsplat.features import FeatureMaps, check_external_features
+from lexsplat.features import FeatureMaps, check_external_features, read_external_features
 from lexsplat.language.code_maps import MaskedCodeMaps, mark_masked_cells
 from lexsplat.language.methods import FitRun, TrainingViews
 from lexsplat.pipeline.config import BuildConfig
@@ -56,7 +57,7 @@ from lexsplat.runtime.errors import (
 )
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.runtime.progress import Event, Listener, kept_warnings, silent, warn_again
+from lexsplat.runtime.progress import NOTE, Event, Listener, kept_warnings, silent, warn_again
 from lexsplat.runtime.training import Checkpoint
 from lexsplat.runtime.workers import IN_PROCESS, SharedFolder, Workers, open_workers
 from lexsplat.scenes.folder import SceneFolder
@@ -248,7 +249,11 @@ class _Builder:
         """The stages of the method, in the order in which they run."""
         config, folder = self.config.result_settings(), self.folder
         method_settings = [config.method, *(getattr(config, part) for part in self.method.settings)]
-        features = [capture_hash, *features_identity(config, self.capture)]
+        features = [
+            capture_hash,
+            *features_identity(config, self.capture),
+            *self.method.feature_inputs(config),
+        ]
         own_features = [] if config.features_from is not None else [folder.features_path]
         language = ["reconstruct", self.method.needs[-1], method_settings, config.seed]
         geometry = [capture_hash, *self.geometry.inputs(config, self.device)]
@@ -349,20 +354,9 @@ class _Builder:
     def _extract_features(self) -> dict[str, Any]:
         maps, given = self._feature_maps(), self.config.features_from
         if given is not None:
-            empty = 0
-            for done, name in enumerate(maps, start=1):
-                # Reading checks them, before anything is made of them.
-                empty += not bool(maps[name].clip.any())
-                self.listener(Event("features", done, len(maps)))
-            if empty == len(maps):
-                raise FileFormatError(
-                    given, expected="segments in some photo", found="none in any", remedy="write them again"
-                )
-            if empty:
-                log.warning(
-                    "%s: %d of %d photos have no segment, and so no features", given, empty, len(maps)
-                )
-        return {"views": len(maps), "clip_hash": self._clip_hash, "dino": self.config.uses_dino}
+            read_external_features(maps, given, self.listener)  # before anything is made of them
+        views = {"views": len(maps), "of": len(self._training_views)}
+        return {**views, "clip_hash": self._clip_hash, "dino": self.config.uses_dino}
 
     def _fit_codebook(self) -> dict[str, Any]:
         maps, names = self._feature_maps(), self.capture.train_names
@@ -383,7 +377,7 @@ class _Builder:
         if "codebook" in self.method.needs:
             views = self._views_with_codes()
         else:
-            views = TrainingViews(self._training_views, features=self._feature_maps())
+            views = replace(self._views_to_read, features=self._feature_maps())
         field = self.method.fit(gaussians, views, self.config, self._fit_run())
         field.method = self.method.name
         metadata = {**field.metadata(), "reconstruction": self.fingerprints["reconstruct"]}
@@ -403,18 +397,35 @@ class _Builder:
         )
 
     def _feature_maps(self) -> FeatureMaps:
-        """Features of the training views. The image encoders are freed when all features are stored."""
+        """Features of the views to read. The image encoders are freed when all features are stored."""
         if self._maps is None:
             config = self.config
             encoders = self.encoders = self.encoders or Encoders.of(config)
             cache = self.folder.features_path
-            training = replace(self.capture, views=self._training_views, test_names=())
+            views = dict(self._views_to_read.views)
+            training = replace(self.capture, views=views, train_names=tuple(views), test_names=())
             if self.workers.distributed and config.features_from is None:
                 extract_on_workers(training, config, encoders, cache, self.workers, self.listener)
             self._maps = feature_maps(training, config, encoders, cache, self.listener)
             self._clip_hash = encoders.clip.content_hash
             encoders.keep_text(self.device)
         return self._maps
+
+    @cached_property
+    def _views_to_read(self) -> TrainingViews:
+        """The training views whose features the method needs."""
+        views = TrainingViews(self._training_views)
+        if not self.method.feature_inputs(self.config):  # no Gaussians are needed to choose
+            return views
+        gaussians = self.folder.read_gaussians().to(self.device)
+        found = self.method.views_to_read(gaussians, views, self.config, self.listener)
+        few, what = (
+            len(found.views),
+            "features of %d of %d training photos, which show everything often enough",
+        )
+        if few < len(views.views):
+            log.log(NOTE, what, few, len(views.views))
+        return found
 
     @property
     def _training_views(self) -> dict[str, View]:

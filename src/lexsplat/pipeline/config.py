@@ -33,6 +33,12 @@ CPU_ITERATIONS = 2_000
 """Reconstruction steps on a CPU if none are given."""
 BLOCKS_ITERATIONS = 3_000
 """The same for a reconstruction in blocks, which replaces no Gaussians: fewer steps were not measured there."""
+SIGHTINGS, BUNDLED_SIGHTINGS = 8, 4
+"""Sightings of a Gaussian (`AveragedConfig.sightings`) if none are given: of any encoder, and of the bundled ones.
+
+Neither the bundled nor web-like encoders gain by more than 3 (docs/lab-notes/2026-11-language.md). Others were not
+measured.
+"""
 PAPER_ITERATIONS = 30_000
 """Reconstruction steps of the paper."""
 CUDA_ITERATIONS = PAPER_ITERATIONS
@@ -241,6 +247,9 @@ class BuildConfig:
         if averaged.dino is None:
             with_dino = features.tokens == "class" and self.dino != "none" and self.features_from is None
             averaged = replace(averaged, dino=with_dino)
+        if averaged.sightings is None:
+            wanted = BUNDLED_SIGHTINGS if self.clip == "bundled" else SIGHTINGS
+            averaged = replace(averaged, sightings=wanted if self.features_from is None else 0)
         iterations = self.iterations
         if iterations is None and self.reconstruction.iterations != ReconstructionConfig.iterations:
             iterations = self.reconstruction.iterations  # set from Python

@@ -49,7 +49,8 @@ class Encoders:
     def __init__(self, clip: str, dino: str, device: str, segments: str = "none") -> None:
         self._clip_name, self._dino_name, self._segments, self.device = clip, dino, segments, device
         self.text: TextTower | None = None
-        self.told = False  # whether the time of the features is estimated, and logged unless it is short
+        self.estimate: Estimate | None = None  # of one photo, once it is measured
+        self.told = 0  # photos for which the time of the features was told last
 
     @classmethod
     def of(cls, config: BuildConfig) -> Encoders:
@@ -156,7 +157,8 @@ def check_encoders(
         check_dense(encoders.dino)
     listener(Event("encoders", 3, 4))
     if photos:
-        _tell(estimate(encoders.clip, encoders.dino, config.features, size), photos, encoders)
+        encoders.estimate = estimate(encoders.clip, encoders.dino, config.features, size)
+        _tell(encoders, photos, at_most=may_leave_photos_out(config))
     listener(Event("encoders", 4, 4))
     return encoders
 
@@ -165,18 +167,26 @@ def _tell_time(capture: Capture, config: BuildConfig, encoders: Encoders, cache_
     """Log the estimated time of the features that are not cached, unless it is a few seconds."""
     clip, dino, settings = encoders.clip, encoders.dino, config.features
     missing = missing_views(capture, clip, dino, settings, cache_dir)
-    if len(missing) < _TOLD_FROM:
-        return
-    sizes = [capture.views[name].capture_size for name in missing]
-    found = estimate(clip, dino, settings, max(sizes, key=lambda size: size[0] * size[1]))
-    _tell(found, len(missing), encoders)
+    if encoders.estimate is None and len(missing) >= _TOLD_FROM:
+        sizes = [capture.views[name].capture_size for name in missing]
+        largest = max(sizes, key=lambda size: size[0] * size[1])
+        encoders.estimate = estimate(clip, dino, settings, largest)
+    if encoders.estimate is not None and len(missing) != encoders.told:
+        _tell(encoders, len(missing))
 
 
-def _tell(found: Estimate, photos: int, encoders: Encoders) -> None:
+def may_leave_photos_out(config: BuildConfig) -> bool:
+    """Whether the method chooses, by the Gaussians, the photos whose features are made."""
+    return bool(config.language_method.feature_inputs(config))
+
+
+def _tell(encoders: Encoders, photos: int, *, at_most: bool = False) -> None:
     """Log the estimated time of the features of some photos, unless it is short."""
-    if found.seconds * photos >= SHORTEST_FORECAST:
-        log.log(NOTE, "features on %s: %s", encoders.device, found.describe(photos))
-    encoders.told = True
+    found = encoders.estimate
+    if found is not None and found.seconds * photos >= SHORTEST_FORECAST:
+        described = found.describe(photos, at_most=at_most)
+        log.log(NOTE, "features on %s: %s", encoders.device, described)
+    encoders.told = photos
 
 
 def feature_maps(
@@ -201,8 +211,7 @@ def feature_maps(
     memory = config.memory_bytes
     if config.features_from is None:
         clip, dino = encoders.clip, encoders.dino
-        if not encoders.told:
-            _tell_time(capture, config, encoders, cache_dir)
+        _tell_time(capture, config, encoders, cache_dir)
         maps = extract_features(
             capture, clip, dino, config.features, cache_dir=cache_dir, memory=memory, listener=listener
         )

@@ -38,12 +38,15 @@ class TrainingViews:
         features: Dense features by view name, for methods that need the stage "features" only.
         code_maps: Index maps ``[h, w]`` by view name, for methods that need the stage "codebook".
         codebook: The discrete feature space S of the index maps.
+        chosen_from: Number of training views of the capture where these are some of them
+            (`LanguageMethod.views_to_read`); 0 if nothing was chosen yet.
     """
 
     views: Mapping[str, View]
     features: Mapping[str, FeatureMap] | None = None
     code_maps: Mapping[str, NDArray[np.integer]] | None = None
     codebook: Codebook | None = None
+    chosen_from: int = 0
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -113,6 +116,14 @@ class LanguageMethod(Protocol):
 
     def uses_dino(self, config: Any) -> bool:
         """Whether a build of these settings uses DINO features."""
+
+    def feature_inputs(self, config: Any) -> list[Any]:
+        """Inputs of the features in addition to photos and encoders; the name of a stage stands for its inputs."""
+
+    def views_to_read(
+        self, gaussians: Gaussians, views: TrainingViews, config: Any, listener: Listener
+    ) -> TrainingViews:
+        """Those of the training views whose features `fit` needs."""
 
     @property
     def variants(self) -> Mapping[str, Variant]:

@@ -54,6 +54,16 @@ class Trained:
         """Always: index maps are made with both halves."""
         return True
 
+    def feature_inputs(self, config: Any) -> list[Any]:
+        """None: the index maps of all views are needed."""
+        return []
+
+    def views_to_read(
+        self, gaussians: Gaussians, views: TrainingViews, config: Any, listener: Listener
+    ) -> TrainingViews:
+        """All of them."""
+        return views
+
     def fit(self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> TrainedField:
         """Train the paper's field on the index maps of the training views."""
         code_maps, codebook = views.require_codes()

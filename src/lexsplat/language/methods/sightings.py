@@ -1,0 +1,97 @@
+"""The training views that method "averaged" reads: as few as show each Gaussian often enough.
+
+Features are often the longest stage of a build, and the mean of a Gaussian hardly changes after its first views
+(docs/lab-notes/2026-11-language.md). The weight of a Gaussian in a view, relative to its largest in any view, is the
+sighting that this view gives: 1 from near by, less from afar or where something hides it in part. Views are taken one
+after the other, always the one that adds most to the sightings that are still wanted. These sums are submodular, so
+that no other choice of as many views has more than e / (e - 1) times as much (Nemhauser, Wolsey and Fisher 1978).
+Dimension letters: V views, n sampled Gaussians.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lexsplat.geometry.cameras import Camera
+from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.rendering import prepare, weigh_cells
+from lexsplat.runtime.device import threads_for_kernels
+from lexsplat.runtime.progress import Event, Listener, silent
+
+if TYPE_CHECKING:
+    from lexsplat.captures import View
+
+ENOUGH = 0.95
+"""Share of the wanted sightings at which no further view is taken."""
+_LONG_SIDE = 120
+_SAMPLE = 16_384
+_LEAST = 0.01
+"""Least weight of a Gaussian in some view, in pixels of 120 along the longer side; others are too small to tell."""
+
+
+@threads_for_kernels()
+def views_that_show(
+    gaussians: Gaussians, views: Mapping[str, View], sightings: int, listener: Listener = silent
+) -> list[str]:
+    """Names of views that show nearly every Gaussian `sightings` times, or as often as all views do; sorted.
+
+    Args:
+        gaussians: The geometry.
+        views: Views to choose from; masked pixels show nothing.
+        sightings: Wanted sightings of each Gaussian, at least 1.
+        listener: Receives events of stage "views to read".
+    """
+    names = sorted(views)
+    if len(names) <= sightings:
+        return names
+    gaussians = gaussians.detach()
+    sample = np.unique(np.linspace(0, len(gaussians) - 1, min(_SAMPLE, len(gaussians))).astype(np.int64))
+    weights = np.zeros((len(names), len(sample)), np.float16)
+    listener(Event("views to read", 0, len(names)))
+    with torch.no_grad():
+        for row, name in enumerate(names):
+            weights[row] = np.minimum(_weights(gaussians, views[name])[sample], np.finfo(np.float16).max)
+            listener(Event("views to read", row + 1, len(names)))
+    return [names[row] for row in covering(weights, sightings)] or names
+
+
+def _weights(gaussians: Gaussians, view: View) -> NDArray[np.float32]:
+    """Weight of each Gaussian in a view ``[N]``, in pixels of a small image of it."""
+    camera: Camera = view.camera.within(_LONG_SIDE)
+    valid = view.load_valid((camera.width, camera.height))
+    counts = torch.ones(camera.height, camera.width) if valid is None else torch.from_numpy(valid).float()
+    prepared = prepare(gaussians, camera)
+    found = weigh_cells(gaussians, camera, (1, 1), counts.to(gaussians.device), prepared)
+    return np.asarray(found.totals().cpu().numpy())
+
+
+def covering(weights: NDArray[np.floating], sightings: float) -> list[int]:
+    """Rows that show nearly every column often enough, in ascending order; none if nothing is shown.
+
+    Args:
+        weights: Weight of each Gaussian in each view ``[V, n]``.
+        sightings: Wanted sum of the weights of a Gaussian, in multiples of its largest.
+    """
+    best = weights.max(axis=0)
+    shown = best >= _LEAST
+    parts = weights[:, shown] / best[shown]
+    wanted = np.minimum(parts.sum(axis=0, dtype=np.float64), sightings)
+    have, chosen = np.zeros_like(wanted), list[int]()
+    # What a view adds only falls as others are taken: what it once added bounds what it adds now.
+    bounds = [(-np.inf, row) for row in range(len(parts))]
+    while have.sum() < ENOUGH * wanted.sum():
+        _, row = heapq.heappop(bounds)
+        together = np.minimum(have + parts[row], wanted)
+        entry = (-float((together - have).sum()), row)
+        if bounds and entry > bounds[0]:
+            heapq.heappush(bounds, entry)
+            continue
+        have = together
+        chosen.append(row)
+    return sorted(chosen)
