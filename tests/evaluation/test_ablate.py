@@ -75,12 +75,20 @@ def test_every_row_of_the_papers_table_switches_off_its_part():
 def test_each_method_has_the_variants_that_change_it():
     table_2 = ("w/o DINO", "w/o L_lb", "w/o u_G", "w/o MLP", "w/o u_G & MLP", "full")
     assert tuple(METHODS["trained"].variants) == table_2
-    lifting = ("gate", "least weight", "squared weights", "agreement", "w/o reliability", "all liftings")
+    lifting = (
+        "gate",
+        "least weight",
+        "squared weights",
+        "agreement",
+        "w/o reliability",
+        "all views",
+        "all liftings",
+    )
     averaged = ("one code", "w/o DINO", "with DINO", *lifting, "full")
     assert tuple(METHODS["averaged"].variants) == averaged
     assert set(VARIANTS) == {*table_2, *averaged}
     weighed = [name for name in averaged if ablation.changed(BuildConfig(), name).averaged.weighs_entries]
-    assert weighed == [name for name in lifting if name != "w/o reliability"]
+    assert weighed == [name for name in lifting if name not in ("w/o reliability", "all views")]
     assert ablation.changed(BuildConfig(), "one code").averaged.top == 1
     with pytest.raises(ValueError, match="averaged"):
         ablation.changed(BuildConfig(), "w/o MLP")

@@ -101,7 +101,8 @@ def test_a_scene_names_the_method_that_made_it_whatever_its_field_says(
         (AVERAGED, {"trained": TrainedConfig(iterations=3)}, set()),
         (AVERAGED, {"memory": "1GB", "checkpoint_seconds": 0.0}, set()),
         (AVERAGED, {"dino": "none"}, {"features", "language"}),
-        (AVERAGED, {"iterations": 5}, {"reconstruct", "language"}),
+        (AVERAGED, {"iterations": 5}, {"reconstruct", "features", "language"}),  # Gaussians choose the views
+        (AVERAGED, {"averaged": AveragedConfig(sightings=0)}, {"features", "language"}),
         (TRAINED, {"averaged": AveragedConfig(top=3)}, set()),
         (TRAINED, {"trained": replace(CONFIG.trained, iterations=3)}, {"language"}),
         (TRAINED, {"codebook": replace(CONFIG.codebook, num_codes=5)}, {"codebook", "language"}),
@@ -115,6 +116,19 @@ def test_a_changed_setting_redoes_what_depends_on_it(
     copy = shutil.copytree(built_by_method / base.method, tmp_path / "copy")
     finished = stages_run(six_views, copy, replace(base, **change))
     assert {name for name, kept in finished.items() if not kept} == redone
+
+
+def test_features_are_made_of_photos_that_show_something_more_and_later_of_the_others(six_views, tmp_path):
+    def photos_with_features(sightings):
+        config = replace(AVERAGED, averaged=AveragedConfig(sightings=sightings))
+        folder = build(six_views, tmp_path / "scene", config)
+        stored = len(list(folder.features_path.glob("*.clip.safetensors")))
+        facts = folder.record["stages"]["features"]
+        return facts["views"], facts["of"], stored
+
+    few, all_photos, stored = photos_with_features(1)
+    assert few == stored < all_photos == 4
+    assert photos_with_features(0) == (4, 4, 4)
 
 
 def test_a_missing_result_is_made_again(built_by_method, six_views, tmp_path):

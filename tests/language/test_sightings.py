@@ -1,0 +1,182 @@
+"""Claims about the views that method "averaged" reads; references are loops by definition and hand-made scenes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from support.language_scene import LanguageScene, make_scene
+from torch.nn.functional import normalize
+
+from lexsplat.features import FeatureMap
+from lexsplat.geometry.cameras import look_at
+from lexsplat.geometry.gaussians import gaussians_from_points
+from lexsplat.language.methods import FitRun, TrainingViews
+from lexsplat.language.methods.averaged import Averaged, AveragedConfig
+from lexsplat.language.methods.sightings import ENOUGH, covering, views_that_show
+from lexsplat.pipeline.config import BuildConfig
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+class View:
+    """A view without a photo; ``valid`` are the pixels that count."""
+
+    def __init__(self, camera, valid=None):
+        self.camera, self.valid = camera, valid
+
+    def load_valid(self, size):
+        return None if self.valid is None else np.full(size[::-1], self.valid)
+
+
+@pytest.fixture(scope="module")
+def scene() -> LanguageScene:
+    return make_scene(per_ball=30, views=12)
+
+
+def looking_at(center, azimuths, distance=4.0):
+    eyes = [center + distance * np.array([np.cos(a), np.sin(a), 0.4]) for a in azimuths]
+    return [View(look_at(eye, center, np.array([0, 0, 1.0]), 64, 48, 0.6)) for eye in eyes]
+
+
+@pytest.fixture(scope="module")
+def two_places():
+    """Two heaps of 200 Gaussians far apart; eight views show the first, one the second."""
+    heap = np.random.default_rng(0).normal(0, 0.3, (200, 3))
+    centers = np.array([[0.0, 0, 0], [100.0, 0, 0]])
+    points = np.concatenate([heap + center for center in centers])
+    gaussians = gaussians_from_points(points, np.full_like(points, 0.5), sh_degree=0, opacity=0.5)
+    first = looking_at(centers[0], np.linspace(0, 2 * np.pi, 8, endpoint=False))
+    (second,) = looking_at(centers[1], [1.0])
+    return gaussians, {**{f"a{i}": view for i, view in enumerate(first)}, "b": second}
+
+
+def test_a_place_that_one_view_shows_is_read_and_a_place_that_many_show_is_read_in_some(two_places):
+    gaussians, views = two_places
+    chosen = views_that_show(gaussians, views, 2)
+    assert "b" in chosen
+    assert 2 <= len(chosen) - 1 < 8
+    assert len(views_that_show(gaussians, views, 4)) > len(chosen)
+
+
+def test_masked_views_show_nothing(two_places):
+    gaussians, views = two_places
+    chosen = views_that_show(gaussians, views, 2)
+    masked = {name: View(view.camera, valid=name not in chosen[:1]) for name, view in views.items()}
+    assert chosen[0] not in views_that_show(gaussians, masked, 2)
+
+
+def test_the_choice_does_not_depend_on_the_order_of_the_views(two_places):
+    gaussians, views = two_places
+    assert views_that_show(gaussians, dict(reversed(views.items())), 2) == views_that_show(
+        gaussians, views, 2
+    )
+
+
+def test_all_views_are_read_where_they_are_few_or_show_nothing(two_places):
+    gaussians, views = two_places
+    few = {name: views[name] for name in ("b", "a0")}
+    assert views_that_show(gaussians, few, 2) == ["a0", "b"]
+    elsewhere = replace(gaussians, means=gaussians.means + 1e4)
+    assert views_that_show(elsewhere, views, 2) == sorted(views)
+
+
+def test_of_three_views_the_near_and_the_opposite_one_are_taken():
+    #  Gaussian      1    2    3
+    weights = [[4.0, 2.0, 0.0],  # near the first two: sightings 1, 1/2, 0
+               [1.0, 0.5, 0.0],  # the same from afar: 1/4, 1/8, 0
+               [0.0, 4.0, 1.0]]  # 0, 1, 1  # fmt: skip
+    assert covering(np.array(weights), 1) == [0, 2]
+
+
+def by_definition(weights, sightings):
+    """The greedy choice, with the sum of all Gaussians for every view at every step, in float64."""
+    best = weights.max(0)
+    parts = [[w / b for w, b in zip(row, best) if b >= 0.01] for row in weights.astype(float)]
+    wanted = [min(sightings, sum(column)) for column in zip(*parts)]
+    chosen: list[int] = []
+
+    def sightings_of(rows):
+        return sum(min(wish, sum(parts[row][n] for row in rows)) for n, wish in enumerate(wanted))
+
+    while sightings_of(chosen) < ENOUGH * sum(wanted) - 1e-9:
+        left = [row for row in range(len(parts)) if row not in chosen]
+        chosen.append(max(left, key=lambda row: (round(sightings_of([*chosen, row]), 9), -row)))
+    return chosen
+
+
+@settings(max_examples=60)
+@given(
+    arrays(np.int64, st.tuples(st.integers(1, 9), st.integers(1, 12)), elements=st.integers(0, 8)),
+    st.integers(1, 4),
+)
+def test_the_choice_is_the_greedy_one_and_shows_nearly_all_that_all_views_show(counts, sightings):
+    weights = counts.astype(float)
+    chosen, expected = covering(weights, sightings), by_definition(weights, sightings)
+    assert len(chosen) == len(expected)  # of equal views, either may be taken
+    shown = weights[:, weights.max(0) > 0]
+    parts = shown / shown.max(0)
+    wanted = np.minimum(parts.sum(0), sightings).sum()
+    assert np.minimum(parts[chosen].sum(0), sightings).sum() >= ENOUGH * wanted - 1e-9
+
+
+def test_the_fit_reads_the_chosen_views_alone_and_trusts_them_as_all(scene):
+    generator = torch.Generator().manual_seed(0)
+    views = {name: View(camera) for name, camera in scene.cameras.items()}
+    codes = {name: torch.from_numpy(found.clip(max=4)).long() for name, found in scene.code_maps.items()}
+    colors = normalize(torch.randn(5, 6, generator=generator), dim=-1)
+    read: set[str] = set()
+
+    class Maps(dict):
+        def __getitem__(self, name):
+            read.add(name)
+            return super().__getitem__(name)
+
+    maps = Maps({name: FeatureMap(colors[codes[name]]) for name in views})
+    config = BuildConfig(dino="none", averaged=AveragedConfig(sightings=3, segments=False))
+    all_views = replace(config, averaged=replace(config.averaged, sightings=0))
+    few = Averaged().fit(scene.gaussians, TrainingViews(views, features=maps), config, FitRun())
+    assert read == set(views_that_show(scene.gaussians, views, 3)) < set(views)
+    every = Averaged().fit(scene.gaussians, TrainingViews(views, features=maps), all_views, FitRun())
+    assert read == set(views)
+    # Sums over a part of the views are smaller, which is no reason to trust them less.
+    assert float((few.uncertainties - every.uncertainties).abs().mean()) < 0.05
+
+
+def test_a_choice_is_made_once(scene):
+    views = TrainingViews({name: View(camera) for name, camera in scene.cameras.items()})
+    config = SimpleNamespace(averaged=AveragedConfig(sightings=3))
+    method, told = Averaged(), []
+    chosen = method.views_to_read(scene.gaussians, views, config, told.append)
+    assert chosen.chosen_from == len(views.views) == told[-1].total
+    assert method.views_to_read(scene.gaussians, chosen, config, told.append) is chosen
+
+
+@pytest.mark.parametrize(
+    ("given_settings", "expected"),
+    [
+        ({"clip": "bundled"}, 4),
+        ({}, 8),
+        ({"averaged": AveragedConfig(sightings=0)}, 0),
+        ({"averaged": AveragedConfig(sightings=2), "clip": "bundled"}, 2),
+    ],
+)
+def test_the_bundled_encoders_need_fewer_sightings_than_any_other(given_settings, expected, monkeypatch):
+    monkeypatch.setattr("lexsplat.pipeline.config.patch_grid", lambda name: 14)
+    assert BuildConfig(**given_settings).resolved("cpu", (640, 480)).averaged.sightings == expected
+
+
+def test_features_of_another_program_are_all_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("lexsplat.pipeline.config.patch_grid", lambda name: 14)
+    assert BuildConfig(features_from=tmp_path).resolved("cpu", (640, 480)).averaged.sightings == 0
+
+
+def test_a_negative_number_of_sightings_is_refused():
+    with pytest.raises(ValueError, match="sightings must not be negative, got -1"):
+        AveragedConfig(sightings=-1)
