@@ -36,7 +36,7 @@ class View:
 
 
 @pytest.fixture(scope="module")
-def scene() -> LanguageScene:
+def ring() -> LanguageScene:
     return make_scene(per_ball=30, views=12)
 
 
@@ -126,10 +126,10 @@ def test_the_choice_is_the_greedy_one_and_shows_nearly_all_that_all_views_show(c
     assert np.minimum(parts[chosen].sum(0), sightings).sum() >= ENOUGH * wanted - 1e-9
 
 
-def test_the_fit_reads_the_chosen_views_alone_and_trusts_them_as_all(scene):
+def test_the_fit_reads_the_chosen_views_alone_and_trusts_them_as_all(ring):
     generator = torch.Generator().manual_seed(0)
-    views = {name: View(camera) for name, camera in scene.cameras.items()}
-    codes = {name: torch.from_numpy(found.clip(max=4)).long() for name, found in scene.code_maps.items()}
+    views = {name: View(camera) for name, camera in ring.cameras.items()}
+    codes = {name: torch.from_numpy(found.clip(max=4)).long() for name, found in ring.code_maps.items()}
     colors = normalize(torch.randn(5, 6, generator=generator), dim=-1)
     read: set[str] = set()
 
@@ -141,21 +141,21 @@ def test_the_fit_reads_the_chosen_views_alone_and_trusts_them_as_all(scene):
     maps = Maps({name: FeatureMap(colors[codes[name]]) for name in views})
     config = BuildConfig(dino="none", averaged=AveragedConfig(sightings=3, segments=False))
     all_views = replace(config, averaged=replace(config.averaged, sightings=0))
-    few = Averaged().fit(scene.gaussians, TrainingViews(views, features=maps), config, FitRun())
-    assert read == set(views_that_show(scene.gaussians, views, 3)) < set(views)
-    every = Averaged().fit(scene.gaussians, TrainingViews(views, features=maps), all_views, FitRun())
+    few = Averaged().fit(ring.gaussians, TrainingViews(views, features=maps), config, FitRun())
+    assert read == set(views_that_show(ring.gaussians, views, 3)) < set(views)
+    every = Averaged().fit(ring.gaussians, TrainingViews(views, features=maps), all_views, FitRun())
     assert read == set(views)
     # Sums over a part of the views are smaller, which is no reason to trust them less.
     assert float((few.uncertainties - every.uncertainties).abs().mean()) < 0.05
 
 
-def test_a_choice_is_made_once(scene):
-    views = TrainingViews({name: View(camera) for name, camera in scene.cameras.items()})
+def test_a_choice_is_made_once(ring):
+    views = TrainingViews({name: View(camera) for name, camera in ring.cameras.items()})
     config = SimpleNamespace(averaged=AveragedConfig(sightings=3))
     method, told = Averaged(), []
-    chosen = method.views_to_read(scene.gaussians, views, config, told.append)
+    chosen = method.views_to_read(ring.gaussians, views, config, told.append)
     assert chosen.chosen_from == len(views.views) == told[-1].total
-    assert method.views_to_read(scene.gaussians, chosen, config, told.append) is chosen
+    assert method.views_to_read(ring.gaussians, chosen, config, told.append) is chosen
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import contextmanager
 
 import pytest
 from support.tiny_capture import write_capture
@@ -91,26 +93,38 @@ def nothing_compiled(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(jit, "_cache_folder", lambda: str(tmp_path))
 
 
-@pytest.mark.parametrize(("status", "times"), [(0, 1), (1, 2), (-1, 2)], ids=["works", "fails", "refused"])
-def test_kernels_are_compiled_by_another_process_until_it_has_worked_once(
-    nothing_compiled, monkeypatch, status, times
+@pytest.mark.parametrize(
+    ("status", "here"), [(0, False), (1, True), (-1, True)], ids=["works", "fails", "refused"]
+)
+def test_kernels_are_compiled_once_by_another_process_or_here_where_it_fails(
+    nothing_compiled, monkeypatch, status, here
 ):
-    started = Started(status)
+    started, trained = Started(status), []
     monkeypatch.setattr(subprocess, "Popen", started)
+    monkeypatch.setattr(first_run, "_train_a_little", lambda: trained.append(True))
     for _ in range(2):
         first_run.compile_kernels("cpu")
-    assert started == [[sys.executable, "-m", "lexsplat.reconstruction.first_run"]] * times
+    assert started == [[sys.executable, "-m", "lexsplat.reconstruction.first_run"]]
+    assert trained == [True] * here
 
 
-@pytest.mark.parametrize(("status", "between"), [(0, [1, 2, 3]), (1, [1, 2, 3]), (-1, [])])
-def test_each_compiled_kernel_moves_the_bar_and_its_end_is_told_in_any_case(
-    nothing_compiled, monkeypatch, status, between
-):
+@pytest.mark.parametrize(
+    ("status", "elsewhere"), [(0, 3), (1, 3), (-1, 0)], ids=["works", "fails", "refused"]
+)
+def test_each_kernel_moves_the_bar_wherever_it_is_compiled(nothing_compiled, monkeypatch, status, elsewhere):
     monkeypatch.setattr(subprocess, "Popen", Started(status))
+    compiled: list[Callable[[], None]] = []
+
+    @contextmanager
+    def each_compiled(told):
+        yield compiled.append(told)
+
+    monkeypatch.setattr(jit, "each_compiled", each_compiled)
+    monkeypatch.setattr(first_run, "_train_a_little", lambda: [compiled[0]() for _ in range(2)])
     events: list[Event] = []
     first_run.compile_kernels("cpu", events.append)
-    kernels = first_run.KERNELS
-    assert events == [Event("kernels", done, kernels) for done in (0, *between, kernels)]
+    kernels, moved = first_run.KERNELS, elsewhere + (2 if status else 0)
+    assert events == [Event("kernels", done, kernels) for done in (*range(moved + 1), kernels)]
 
 
 def test_the_other_process_ends_when_this_one_is_interrupted(nothing_compiled, monkeypatch):

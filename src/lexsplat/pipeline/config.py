@@ -36,8 +36,7 @@ BLOCKS_ITERATIONS = 3_000
 SIGHTINGS, BUNDLED_SIGHTINGS = 8, 4
 """Sightings of a Gaussian (`AveragedConfig.sightings`) if none are given: of any encoder, and of the bundled ones.
 
-Neither the bundled nor web-like encoders gain by more than 3 (docs/lab-notes/2026-11-language.md). Others were not
-measured.
+With more, neither gains; with 4, web-like encoders lose (docs/lab-notes/2026-11-language.md).
 """
 PAPER_ITERATIONS = 30_000
 """Reconstruction steps of the paper."""

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from lexsplat.geometry.cameras import look_at
-from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.rendering.first_drawing import STAGE, small_scene
 from lexsplat.runtime.progress import Event, Listener, silent
 
-STAGE = "kernels"
 KERNELS = 21
 """Kernels that a training calls. Each takes about a second with those that it calls itself."""
 
@@ -22,7 +21,7 @@ KERNELS = 21
 def compile_kernels(device: torch.device | str, listener: Listener = silent) -> None:
     """Compile the kernels of a training on the CPU that no run has compiled yet; the training loads them then.
 
-    Where no other process can be started, the training compiles them itself.
+    Where the other process cannot be started or fails, this one compiles them.
 
     Args:
         device: Device of the training.
@@ -36,15 +35,22 @@ def compile_kernels(device: torch.device | str, listener: Listener = silent) -> 
     if marker.exists():
         return
     jit.announce()
+    done = itertools.count(1)
+
+    def count() -> None:
+        listener(Event(STAGE, min(next(done), KERNELS - 1), KERNELS))
+
     listener(Event(STAGE, 0, KERNELS))
-    if _compiled_elsewhere(marker.parent, listener):
-        with suppress(OSError):  # the next training asks again
-            marker.touch()
+    if not _compiled_elsewhere(marker.parent, count):
+        with jit.each_compiled(count):
+            _train_a_little()
+    with suppress(OSError):  # the next training asks again
+        marker.touch()
     listener(Event(STAGE, KERNELS, KERNELS))
 
 
-def _compiled_elsewhere(folder: Path, listener: Listener) -> bool:
-    """Whether another process has compiled the kernels; it writes a line after each."""
+def _compiled_elsewhere(folder: Path, count: Callable[[], None]) -> bool:
+    """Whether another process has compiled the kernels; it writes a line after each, which is counted."""
     # In a folder of ours: Python looks for modules where it starts.
     command = [sys.executable, "-m", __name__]
     try:
@@ -53,8 +59,8 @@ def _compiled_elsewhere(folder: Path, listener: Listener) -> bool:
         return False
     with started as process:
         try:
-            for done, _ in enumerate(process.stdout or (), 1):
-                listener(Event(STAGE, min(done, KERNELS - 1), KERNELS))
+            for _ in process.stdout or ():
+                count()
         except BaseException:  # such as Ctrl-C, which need not reach the other process
             process.kill()
             raise
@@ -66,13 +72,7 @@ def _train_a_little() -> None:
     from lexsplat.reconstruction.image_losses import photometric_loss, ssim_target
     from lexsplat.rendering import prepare, render, weigh_cells
 
-    means, quats, scales, logits, sh0, shN = (
-        torch.ones(*shape, requires_grad=True)
-        for shape in ((1, 3), (1, 4), (1, 3), (1,), (1, 1, 3), (1, 3, 3))
-    )
-    gaussians = Gaussians(means, quats, scales, logits, sh0, shN)
-    center, up = np.ones(3), np.array([0.0, 1.0, 0.0])
-    camera = look_at(np.array([1.0, 1.0, 9.0]), center, up, 16, 16, 1.0)
+    gaussians, camera = small_scene()
     features = torch.ones(1, 4, requires_grad=True)
     photo = ssim_target(torch.zeros(16, 16, 3))
     for channels in (None, features):
@@ -88,8 +88,8 @@ def _train_a_little() -> None:
 def _main() -> None:
     from lexsplat.rendering.kernels import jit
 
-    jit.when_compiled(lambda: print(flush=True))
-    _train_a_little()
+    with jit.each_compiled(lambda: print(flush=True)):
+        _train_a_little()
 
 
 if __name__ == "__main__":

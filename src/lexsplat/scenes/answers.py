@@ -27,6 +27,7 @@ from lexsplat.queries.spelling import singular
 from lexsplat.queries.thresholds import BORDER, scene_thresholds
 from lexsplat.queries.visibility import without_hidden
 from lexsplat.queries.vocabulary import STUFF
+from lexsplat.rendering.first_drawing import compile_drawing
 from lexsplat.runtime.errors import QueryError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.progress import Event
@@ -173,6 +174,7 @@ def answer_queries(
         QueryError: If a prompt is empty, a view is unknown, or the threshold is not in 0..1.
     """
     names = [scene.view(name).name for name in views] or default_views(scene)
+    compile_drawing(scene.gaussians.device, scene.listener)
     found = scene.ask(prompts, threshold)
     thresholds = found.thresholds.tolist()
     answers: list[dict[str, Any]] = [

@@ -13,8 +13,9 @@ import logging
 import os
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -123,9 +124,11 @@ class _Compiled(event.Listener):
                 self._told()
 
 
-def when_compiled(told: Callable[[], None]) -> None:
-    """Call a function after each kernel that is compiled because Python calls it, in a process of one thread."""
-    event.register("numba:compile", _Compiled(told))
+@contextmanager
+def each_compiled(told: Callable[[], None]) -> Iterator[None]:
+    """Call a function after each kernel that this block compiles because Python calls it, on one thread."""
+    with event.install_listener("numba:compile", _Compiled(told)):
+        yield
 
 
 _pool: ThreadPoolExecutor | None = None
