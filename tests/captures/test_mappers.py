@@ -67,3 +67,11 @@ def attempted(mapper: str, count: int) -> list[tuple[str, int, int]]:
     names = SimpleNamespace(names=("a.jpg",) * count)
     assert photos._attempt(Path("a.db"), names, mapper, 0, events.append, all_pairs=False) is None
     return [(event.stage, event.done, event.total) for event in events]
+
+
+@pytest.mark.parametrize(
+    ("photos", "threads", "size"), [(8, 2, 2), (12, 2, 4), (15, 2, 4), (300, 2, 8), (12, 1, 3), (300, 32, 32)]
+)
+def test_features_come_in_calls_that_leave_no_thread_idle_and_allow_a_forecast(photos, threads, size):
+    assert mapping.batch_size(photos, threads) == size
+    assert size <= photos / 3 or size == threads

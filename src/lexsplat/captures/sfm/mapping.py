@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from lexsplat.captures.sfm.preparation import PreparedPhotos
 
 SEQUENTIAL_OVERLAP = 12
-BATCH = 8
-"""Photos per call of SIFT extraction: the most work that an interruption can lose."""
+_BATCH = 8
+_PARTS = 4
 
 MAX_LEFTOVER_PAIRS = 20_000
 """Most pairs that are matched to register photos which sequential matching left unregistered."""
@@ -121,8 +121,9 @@ def extract_features(
     threads = extraction_threads(photos.largest, config.max_side, config.max_features, memory, masked=masked)
     options = pycolmap.FeatureExtractionOptions(max_image_size=config.max_side, num_threads=threads)
     options.sift.max_num_features = config.max_features
-    for start in range(0, len(photos.names), BATCH):
-        batch = list(photos.names[start : start + BATCH])
+    size = batch_size(len(photos.names), threads)
+    for start in range(0, len(photos.names), size):
+        batch = list(photos.names[start : start + size])
         pycolmap.extract_features(
             database,
             photos.images,
@@ -133,6 +134,15 @@ def extract_features(
             device=pycolmap.Device.cpu,
         )
         listener(start + len(batch))
+
+
+def batch_size(photos: int, threads: int) -> int:
+    """Photos per call of SIFT extraction: the most work that an interruption can lose.
+
+    All threads have a photo. Beyond that, there are calls enough for a forecast after the first of them.
+    """
+    wanted = min(_BATCH, photos / _PARTS)
+    return threads * max(1, round(wanted / threads))
 
 
 def _complete_masks(photos: PreparedPhotos, masks: Path, folder: Path) -> Path:
