@@ -353,6 +353,31 @@ def test_a_first_addition_that_was_killed_goes_on(rooms_copy, left):
     ]  # fmt: skip
 
 
+def test_an_addition_that_was_killed_after_its_first_file_goes_on_under_the_same_name(
+    rooms_copy, monkeypatch
+):
+    scene = write_scene(rooms_copy / "hall", OTHERS, segments=True)
+    library = Library.create(rooms_copy / "new")
+
+    def killed_before_the_codes(path, *rest):
+        if not path.name.endswith(".objects.safetensors"):
+            raise KeyboardInterrupt
+        write_tensors(path, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("lexsplat.scenes.library.entries.write_tensors", killed_before_the_codes)
+        with pytest.raises(KeyboardInterrupt):
+            library.add(scene)
+    (left,) = library.stage.glob("hall.*")
+    assert left.name.endswith(".objects.safetensors")
+    assert Library(rooms_copy / "new").verify() == {}
+    other = Library(rooms_copy / "new")
+    assert other.add(rooms_copy / "lab").name == "lab"
+    assert not left.exists()
+    left.touch()
+    assert other.add(scene).name == "hall"
+
+
 @pytest.mark.parametrize(
     "change", [{"content": "../x"}, {"encoder": "a/b"}, {"codes": -1}, {"codes": "many"}]
 )

@@ -65,7 +65,15 @@ def scene_facts(folder: SceneFolder) -> dict[str, Any]:
         "scene": str(folder.root),
         "capture": record.get("capture"),
         "chosen_views": _chosen_views(record),
-        "views": {"training": splits.count("train"), "held out": splits.count("test")},
+        "views": {
+            "training": splits.count("train"),
+            "held out": splits.count("test"),
+            **(
+                {"with features": stages["features"]["views"]}
+                if "views" in stages.get("features", {})
+                else {}
+            ),
+        },
         "size": ", ".join(sizes),
         **world_of(record, {name: view.camera for name, view in views.items()}).to_json(),
         "finished": ", ".join(stages) or "nothing yet",

@@ -33,6 +33,7 @@ from lexsplat.scenes.library.records import (
     OWN_FILE,
     REMOVED,
     Record,
+    abandoned,
     command,
     read_record,
     recovered_record,
@@ -287,7 +288,7 @@ class Library:
             own = OWN_FILE.fullmatch(path.name)
             if own and (own[1] in leaving or path.name not in kept.get(own[1], {path.name})):
                 path.unlink(missing_ok=True)
-        for path in marks.values():
+        for path in (*marks.values(), *abandoned(self.stage)):
             path.unlink(missing_ok=True)
 
     def add(self, path: str | Path) -> Record:

@@ -179,8 +179,21 @@ def scenes_without_record(stage: Path) -> set[str]:
     """Names of scenes whose codes are there without a record, and which are not being removed."""
     listed = os.listdir(stage) if stage.is_dir() else []
     records = {file.removesuffix(".json") for file in listed if file.endswith(".json")}
-    lost = {scene for _, scene in _own_files(stage)} - records
+    lost = _with_codes(stage) - records
     return lost - removals(stage).keys() if lost else lost
+
+
+def abandoned(stage: Path) -> list[Path]:
+    """First files of additions that were killed before the second: objects without codes and without a record."""
+    files, coded = _own_files(stage), _with_codes(stage)
+    return [
+        stage / file for file, scene in files if scene not in coded and not (stage / f"{scene}.json").exists()
+    ]
+
+
+def _with_codes(stage: Path) -> set[str]:
+    """Names of scenes with a file of codes."""
+    return {scene for file, scene in _own_files(stage) if not file.endswith(".objects.safetensors")}
 
 
 def removals(stage: Path) -> dict[str, Path]:
