@@ -11,7 +11,7 @@ import torch
 from lexsplat.geometry.cameras import Camera, look_at
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.rendering.compositing import render
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Event, Listener, silent, uncounted
 
 STAGE = "kernels"
 KERNELS = 9
@@ -23,11 +23,12 @@ def compile_drawing(device: torch.device | str, listener: Listener = silent) -> 
 
     Args:
         device: Device of the Gaussians; nothing is compiled for others than the CPU.
-        listener: Hears an event of stage "kernels" for each.
+        listener: Hears the import of the compiler as stage "rasterizer", and an event of stage "kernels" for each.
     """
     if torch.device(device).type != "cpu":
         return
-    from lexsplat.rendering.kernels import jit
+    with uncounted(listener, "rasterizer"):
+        from lexsplat.rendering.kernels import jit
 
     marker = jit.marker_of("drawing")
     if marker.exists() or jit.marker_of("training").exists():
