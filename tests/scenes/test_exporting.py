@@ -10,13 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support.splats import tame
 from support.tiny_capture import QUICK_BUILD as QUICK
 
 from lexsplat import cli, open_scene
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.visibility import whole_things
+from lexsplat.runtime.progress import Event
 from lexsplat.scenes.exporting import best_labels, export_gaussians
+from lexsplat.scenes.formats import sog_writing
 from lexsplat.scenes.formats.ply import read_ply
 from lexsplat.scenes.formats.reading import read_splats
 from lexsplat.scenes.formats.splat import write_splat
@@ -182,3 +185,15 @@ def test_splats_that_the_cameras_do_not_see_are_refused(built, tiny_capture, tmp
     assert "in the axes and units of the cameras" in capsys.readouterr().err
     assert cli.main([*arguments, str(tmp_path / "absent.ply"), *QUICK]) == 1
     assert "no such file" in capsys.readouterr().err
+
+
+def test_the_palette_of_a_large_sog_is_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(sog_writing, "_MOST_INDICES", 100)
+    monkeypatch.setattr(sog_writing, "_BLOCK", 64)
+    events: list[Event] = []
+    export_gaussians(tame(320, 1), tmp_path / "g.sog", listener=events.append)
+    steps = sog_writing._PALETTE_STEPS + 1  # the last one finds the entry of every Gaussian
+    assert events == [Event("palette", done, steps * 5) for done in range(steps * 5 + 1)]
+    few: list[Event] = []
+    export_gaussians(tame(20, 1), tmp_path / "few.sog", listener=few.append)
+    assert few == [], "each has an entry of its own"

@@ -83,8 +83,10 @@ class Export:
         else:
             cameras = {name: view.camera for name, view in folder.read_cameras().items()}
             world = world_of(folder.record, cameras)
-            with uncounted(LateProgress(), "export"):
-                files = export_gaussians(folder.read_gaussians(), self.file, world=world, overwrite=True)
+            progress = LateProgress()
+            with uncounted(progress, "export"):
+                gaussians = folder.read_gaussians()
+                files = export_gaussians(gaussians, self.file, world=world, overwrite=True, listener=progress)
         for file in files:  # an existing file was confirmed above
             print(f"{file}: {file.stat().st_size:,} bytes")
 

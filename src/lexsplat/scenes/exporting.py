@@ -16,7 +16,7 @@ from lexsplat.queries.selection import Selection
 from lexsplat.queries.visibility import whole_things
 from lexsplat.runtime.errors import QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path, write_json
-from lexsplat.runtime.progress import NOTE
+from lexsplat.runtime.progress import NOTE, Listener, silent
 from lexsplat.scenes.formats.compressed import COMPRESSED, write_compressed
 from lexsplat.scenes.formats.gltf import write_glb
 from lexsplat.scenes.formats.language import (
@@ -66,6 +66,7 @@ def export_gaussians(
     language: StoredLanguage | None = None,
     world: World | None = None,
     overwrite: bool = False,
+    listener: Listener = silent,
 ) -> list[Path]:
     """Write Gaussians in the format of the name's ending.
 
@@ -76,6 +77,7 @@ def export_gaussians(
         world: Up and scale of the scene, for ``.glb``: it has y up, and meters if the scale is known. The other
             formats keep the scene's axes and units, so that they match its cameras.
         overwrite: Replace files that exist.
+        listener: Receives events of stage "palette" for ``.sog``.
 
     Returns:
         The files that were written.
@@ -99,7 +101,7 @@ def export_gaussians(
         ".splat": partial(write_splat, gaussians),
         ".spz": partial(write_spz, gaussians),
         ".v3.spz": partial(write_spz, gaussians, version=3),
-        ".sog": partial(write_sog, gaussians),
+        ".sog": partial(write_sog, gaussians, listener=listener),
         ".glb": partial(write_glb, gaussians, language=language, world=world),
         **{name: partial(write_compressed, gaussians, kind=kind) for name, kind in COMPRESSED.items()},
     }
@@ -173,7 +175,9 @@ def export_scene(
         mask = torch.stack([thing.mask for thing in things]).any(0)
         gaussians = gaussians.select(mask)
         stored = stored.select(mask.cpu()) if stored else None
-    return export_gaussians(gaussians, path, language=stored, world=scene.world, overwrite=overwrite)
+    return export_gaussians(
+        gaussians, path, language=stored, world=scene.world, overwrite=overwrite, listener=scene.listener
+    )
 
 
 def _require_something(found: Sequence[Selection], things: Sequence[Selection]) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import math
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.formats.foreign import without_the_largest
 from lexsplat.scenes.formats.sog import COEFFICIENTS, FIRST_TAG, META, PALETTE_WIDTH
 
@@ -29,11 +32,16 @@ _PALETTE_STEPS = 3
 _BLOCK = 1 << 12
 
 
-def write_sog(gaussians: Gaussians, path: Path) -> None:
+def write_sog(gaussians: Gaussians, path: Path, listener: Listener = silent) -> None:
     """Write a ``.sog`` archive of version 2; the order of the Gaussians is preserved.
 
     Spherical harmonics beyond degree 3, the format's limit, are dropped. More than 65,536 Gaussians share a palette
     of 8,192 entries, found by k-means; fewer have an entry each.
+
+    Args:
+        gaussians: The Gaussians.
+        path: The file.
+        listener: Receives events of stage "palette".
 
     Raises:
         ValueError: If a value is NaN or infinite, or there are no Gaussians.
@@ -65,7 +73,7 @@ def write_sog(gaussians: Gaussians, path: Path) -> None:
     files = {name: _webp(pixels, width) for name, pixels in pictures.items()}
     if g.sh_degree:
         bands = min(g.sh_degree, 3)
-        meta["shN"], palette, labels = _harmonics(g.shN[:, : COEFFICIENTS[bands]], bands)
+        meta["shN"], palette, labels = _harmonics(g.shN[:, : COEFFICIENTS[bands]], bands, listener)
         files["shN_centroids.webp"] = _webp(palette, PALETTE_WIDTH * COEFFICIENTS[bands])
         files["shN_labels.webp"] = _webp(labels, width)
     with zipfile.ZipFile(path, "w") as archive:  # WebP does not shrink further
@@ -128,9 +136,11 @@ def _indexed(values: NDArray[np.float32]) -> tuple[NDArray[np.uint8], list[float
     return labels.astype(np.uint8).reshape(values.shape), centers.astype(np.float32).tolist()
 
 
-def _harmonics(shN: Tensor, bands: int) -> tuple[dict[str, Any], NDArray[np.uint8], NDArray[np.uint8]]:
+def _harmonics(
+    shN: Tensor, bands: int, listener: Listener
+) -> tuple[dict[str, Any], NDArray[np.uint8], NDArray[np.uint8]]:
     """The entry of ``meta.json``, the palette's pixels, and each Gaussian's index in it as a pixel."""
-    palette, labels = _clustered(shN.flatten(1))
+    palette, labels = _clustered(shN.flatten(1), listener)
     entries = len(palette)
     colors, table = _indexed(palette.reshape(-1, 3).numpy())
     index = labels.numpy()
@@ -140,22 +150,30 @@ def _harmonics(shN: Tensor, bands: int) -> tuple[dict[str, Any], NDArray[np.uint
     return meta, _opaque(colors), pixels.astype(np.uint8)
 
 
-def _clustered(rows: Tensor) -> tuple[Tensor, Tensor]:
+def _clustered(rows: Tensor, listener: Listener) -> tuple[Tensor, Tensor]:
     """Centers of the rows ``[N, C]`` and the nearest one of each row, by seeded k-means; few rows are centers."""
     if len(rows) <= _MOST_INDICES:
         return rows, torch.arange(len(rows))
     order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))
     centers, sample = rows[order[:_ENTRIES]].clone(), rows[order[:_SAMPLE]]
+    done, total = itertools.count(), _PALETTE_STEPS * len(sample.split(_BLOCK)) + len(rows.split(_BLOCK))
+
+    def count() -> None:
+        listener(Event("palette", next(done), total))
+
+    count()
     for _ in range(_PALETTE_STEPS):
-        labels = _nearest(sample, centers)
+        labels = _nearest(sample, centers, count)
         counts = torch.bincount(labels, minlength=len(centers))[:, None]
         sums = torch.zeros_like(centers).index_add_(0, labels, sample)
         centers = torch.where(counts > 0, sums / counts.clamp_min(1), centers)
-    return centers, _nearest(rows, centers)
+    return centers, _nearest(rows, centers, count)
 
 
-def _nearest(rows: Tensor, centers: Tensor) -> Tensor:
-    """Index of the nearest center ``[N]``: the least |c|^2 - 2 r c."""
-    lengths = (centers**2).sum(1)
-    blocks = [torch.addmm(lengths, block, centers.T, alpha=-2).argmin(1) for block in rows.split(_BLOCK)]
+def _nearest(rows: Tensor, centers: Tensor, count: Callable[[], None]) -> Tensor:
+    """Index of the nearest center ``[N]``: the least |c|^2 - 2 r c. Blocks of rows are counted."""
+    lengths, blocks = (centers**2).sum(1), []
+    for block in rows.split(_BLOCK):
+        blocks.append(torch.addmm(lengths, block, centers.T, alpha=-2).argmin(1))
+        count()
     return torch.cat(blocks)

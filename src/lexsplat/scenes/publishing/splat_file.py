@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.formats.ply import write_ply
 from lexsplat.scenes.formats.sog_writing import write_sog
 from lexsplat.scenes.formats.spz import is_coarse, write_spz
@@ -25,7 +26,9 @@ _HALF_TURN: Rotation = (1.0, 0.0, 0.0, 0.0)
 """Rotation xyzw from the axes of SPZ (y up, z backward) to those of the scene."""
 
 
-def write_splats(gaussians: Gaussians, folder: Path, shrink: bool = False) -> tuple[Path, Rotation]:
+def write_splats(
+    gaussians: Gaussians, folder: Path, shrink: bool = False, listener: Listener = silent
+) -> tuple[Path, Rotation]:
     """Write the splats into a folder, in the order given.
 
     Small scenes become a PLY, others an SPZ 3 (the page's renderer reads no newer version), or a SOG where a far
@@ -35,6 +38,7 @@ def write_splats(gaussians: Gaussians, folder: Path, shrink: bool = False) -> tu
         gaussians: The splats.
         folder: An existing folder.
         shrink: Write a large scene as SOG where that is smaller.
+        listener: Receives events of stage "palette" while a SOG is written.
 
     Returns:
         The file, and the rotation xyzw from its axes to those of the scene.
@@ -45,13 +49,13 @@ def write_splats(gaussians: Gaussians, folder: Path, shrink: bool = False) -> tu
         return path, _NONE
     if is_coarse(gaussians):
         path = folder / f"{NAME}.sog"
-        write_sog(gaussians, path)
+        write_sog(gaussians, path, listener)
         return path, _NONE
     path = folder / f"{NAME}.spz"
     write_spz(gaussians, path, version=3)
     if shrink and path.stat().st_size > LARGE_BYTES:
         other = folder / f"{NAME}.sog"
-        write_sog(gaussians, other)
+        write_sog(gaussians, other, listener)
         if other.stat().st_size < path.stat().st_size:
             path.unlink()
             return other, _NONE

@@ -196,7 +196,7 @@ def _write_content(scene: Scene, folder: Path, options: PublishOptions) -> dict[
     scene.listener(Event(_STAGE, 0, _STEPS))
     kept = most_visible(scene.gaussians, options.max_splats or len(scene.gaussians))
     gaussians = scene.gaussians.select(kept.to(scene.gaussians.device)).to("cpu")
-    splats, rotation = write_splats(gaussians, folder, shrink=True)
+    splats, rotation = write_splats(gaussians, folder, shrink=True, listener=scene.listener)
     scene.listener(Event(_STAGE, 1, _STEPS))
     identity = scene.encoder_identity()
     language = stored_language(scene.field, identity).select(kept)
