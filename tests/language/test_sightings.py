@@ -19,7 +19,7 @@ from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.language.methods import FitRun, TrainingViews
 from lexsplat.language.methods.averaged import Averaged, AveragedConfig
-from lexsplat.language.methods.sightings import ENOUGH, covering, views_that_show
+from lexsplat.language.methods.sightings import ENOUGH, ENOUGH_ONCE, covering, views_that_show
 from lexsplat.pipeline.config import BuildConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -95,19 +95,28 @@ def test_of_three_views_the_near_and_the_opposite_one_are_taken():
     assert covering(np.array(weights), 1) == [0, 2]
 
 
+def test_a_place_with_few_gaussians_is_read_before_others_are_read_twice():
+    """Forty of a thousand Gaussians are less than the share at which the second reading ends."""
+    weights = np.zeros((9, 1000))
+    weights[:8, 40:] = 1
+    weights[8, :40] = 1
+    assert 8 in covering(weights, 4)
+
+
 def by_definition(weights, sightings):
     """The greedy choice, with the sum of all Gaussians for every view at every step, in float64."""
     best = weights.max(0)
     parts = [[w / b for w, b in zip(row, best) if b >= 0.01] for row in weights.astype(float)]
-    wanted = [min(sightings, sum(column)) for column in zip(*parts)]
     chosen: list[int] = []
 
-    def sightings_of(rows):
+    def sightings_of(rows, wanted):
         return sum(min(wish, sum(parts[row][n] for row in rows)) for n, wish in enumerate(wanted))
 
-    while sightings_of(chosen) < ENOUGH * sum(wanted) - 1e-9:
-        left = [row for row in range(len(parts)) if row not in chosen]
-        chosen.append(max(left, key=lambda row: (round(sightings_of([*chosen, row]), 9), -row)))
+    for most, enough in ((1, ENOUGH_ONCE), (sightings, ENOUGH)):
+        wanted = [min(most, sum(column)) for column in zip(*parts)]
+        while sightings_of(chosen, wanted) < enough * sum(wanted) - 1e-9:
+            left = [row for row in range(len(parts)) if row not in chosen]
+            chosen.append(max(left, key=lambda row: (round(sightings_of([*chosen, row], wanted), 9), -row)))
     return chosen
 
 

@@ -31,7 +31,7 @@ def test_the_forecast_is_the_sum_over_the_steps_and_leaves_the_training_alone(ti
     found = forecasting.forecast(capture, config, points, memory=1 << 30, listener=events.append)
     done = [event.done for event in events]
     assert done == sorted(done)
-    assert (done[0], done[-1], events[0].total) == (0, 48, 48)
+    assert (done[0], done[-1], events[0].total) == (0, 112, 112)
     assert torch.equal(torch.get_rng_state(), state)
     view = capture.train_views[0].camera
     counts = forecasting._counts(config, len(points.points), config.cap(torch.device("cpu")))

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from lexsplat.captures import Capture, InitialPoints
 
 _TOLD_FROM = 1000
-"""Fewest iterations with a forecast; the calibration takes as long as about fifty of them."""
-_FIRST = 8
+"""Fewest iterations with a forecast; the calibration takes as long as about a hundred of them."""
+_FIRST = 24
 """Steps that are not timed: the first Gaussians are large and faint, and take two to seven times as long."""
 _STEPS = 4
 _NEIGHBORS = 3

@@ -3,8 +3,9 @@
 Features are often the longest stage of a build, and the mean of a Gaussian hardly changes after its first views
 (docs/lab-notes/2026-11-language.md). The weight of a Gaussian in a view, relative to its largest in any view, is the
 sighting that this view gives: 1 from near by, less from afar or where something hides it in part. Views are taken one
-after the other, always the one that adds most to the sightings that are still wanted. These sums are submodular, so
-that no other choice of as many views has more than e / (e - 1) times as much (Nemhauser, Wolsey and Fisher 1978).
+after the other, always the one that adds most to the sightings that are still wanted. First one sighting of every
+Gaussian is wanted, so that no place is left out, then as many as are asked for. These sums are submodular, so that no
+other choice of as many views has more than e / (e - 1) times as much (Nemhauser, Wolsey and Fisher 1978).
 Dimension letters: V views, n sampled Gaussians.
 """
 
@@ -27,8 +28,8 @@ from lexsplat.runtime.progress import Event, Listener, silent
 if TYPE_CHECKING:
     from lexsplat.captures import View
 
-ENOUGH = 0.95
-"""Share of the wanted sightings at which no further view is taken."""
+ENOUGH_ONCE, ENOUGH = 0.999, 0.95
+"""Shares of the wanted sightings at which no further view is taken: of one for every Gaussian, and of all."""
 _LONG_SIDE = 120
 _SAMPLE = 16_384
 _LEAST = 0.01
@@ -81,17 +82,19 @@ def covering(weights: NDArray[np.floating], sightings: float) -> list[int]:
     best = weights.max(axis=0)
     shown = best >= _LEAST
     parts = weights[:, shown] / best[shown]
-    wanted = np.minimum(parts.sum(axis=0, dtype=np.float64), sightings)
-    have, chosen = np.zeros_like(wanted), list[int]()
-    # What a view adds only falls as others are taken: what it once added bounds what it adds now.
-    bounds = [(-np.inf, row) for row in range(len(parts))]
-    while have.sum() < ENOUGH * wanted.sum():
-        _, row = heapq.heappop(bounds)
-        together = np.minimum(have + parts[row], wanted)
-        entry = (-float((together - have).sum()), row)
-        if bounds and entry > bounds[0]:
-            heapq.heappush(bounds, entry)
-            continue
-        have = together
-        chosen.append(row)
+    possible = parts.sum(axis=0, dtype=np.float64)
+    have, chosen = np.zeros_like(possible), set[int]()
+    for wish, enough in ((min(1, sightings), ENOUGH_ONCE), (sightings, ENOUGH)):
+        wanted = np.minimum(possible, wish)
+        # What a view adds only falls as others are taken: what it once added bounds what it adds now.
+        bounds = [(-np.inf, row) for row in range(len(parts)) if row not in chosen]
+        while np.minimum(have, wanted).sum() < enough * wanted.sum():
+            _, row = heapq.heappop(bounds)
+            added = np.minimum(have + parts[row], wanted) - np.minimum(have, wanted)
+            entry = (-float(added.sum()), row)
+            if bounds and entry > bounds[0]:
+                heapq.heappush(bounds, entry)
+                continue
+            have = have + parts[row]
+            chosen.add(row)
     return sorted(chosen)
