@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from support.blind_workers import BlindWorkers
 from support.language_scene import LanguageScene, make_scene
 from torch.nn.functional import normalize
 
@@ -18,9 +19,11 @@ from lexsplat.features import FeatureMap
 from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.language.methods import FitRun, TrainingViews
+from lexsplat.language.methods import sightings as sightings_module
 from lexsplat.language.methods.averaged import Averaged, AveragedConfig
 from lexsplat.language.methods.sightings import ENOUGH, ENOUGH_ONCE, covering, views_that_show
 from lexsplat.pipeline.config import BuildConfig
+from lexsplat.runtime.progress import Event
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -59,32 +62,53 @@ def two_places():
 
 def test_a_place_that_one_view_shows_is_read_and_a_place_that_many_show_is_read_in_some(two_places):
     gaussians, views = two_places
-    chosen = views_that_show(gaussians, views, 2)
+    chosen = views_that_show(gaussians, views, 2, FitRun())
     assert "b" in chosen
     assert 2 <= len(chosen) - 1 < 8
-    assert len(views_that_show(gaussians, views, 4)) > len(chosen)
+    assert len(views_that_show(gaussians, views, 4, FitRun())) > len(chosen)
 
 
 def test_masked_views_show_nothing(two_places):
     gaussians, views = two_places
-    chosen = views_that_show(gaussians, views, 2)
+    chosen = views_that_show(gaussians, views, 2, FitRun())
     masked = {name: View(view.camera, valid=name not in chosen[:1]) for name, view in views.items()}
-    assert chosen[0] not in views_that_show(gaussians, masked, 2)
+    assert chosen[0] not in views_that_show(gaussians, masked, 2, FitRun())
 
 
 def test_the_choice_does_not_depend_on_the_order_of_the_views(two_places):
     gaussians, views = two_places
-    assert views_that_show(gaussians, dict(reversed(views.items())), 2) == views_that_show(
-        gaussians, views, 2
+    backwards = dict(reversed(views.items()))
+    chosen = views_that_show(gaussians, views, 2, FitRun())
+    assert views_that_show(gaussians, backwards, 2, FitRun()) == chosen
+
+
+def test_the_choice_does_not_depend_on_workers(two_places, tmp_path):
+    gaussians, views = two_places
+    (tmp_path / "scene").mkdir()
+    workers, told = BlindWorkers(tmp_path / "scene"), list[Event]()
+    run = FitRun(workers=workers, listener=told.append)
+    assert views_that_show(gaussians, views, 2, run) == views_that_show(gaussians, views, 2, FitRun())
+    assert (workers.tasks, told[-1].done, told[-1].total) == (1, 9, 9)
+
+
+def test_many_views_are_compared_by_fewer_gaussians(two_places, monkeypatch):
+    gaussians, views = two_places
+    monkeypatch.setattr(sightings_module, "_MOST_NUMBERS", 9 * 100)
+    monkeypatch.setattr(sightings_module, "_FEWER", 50)
+    shapes = []
+    monkeypatch.setattr(
+        sightings_module, "covering", lambda weights, wish: shapes.append(weights.shape) or [0]
     )
+    assert views_that_show(gaussians, views, 2, FitRun()) == ["a0"]
+    assert shapes == [(9, 100)]
 
 
 def test_all_views_are_read_where_they_are_few_or_show_nothing(two_places):
     gaussians, views = two_places
     few = {name: views[name] for name in ("b", "a0")}
-    assert views_that_show(gaussians, few, 2) == ["a0", "b"]
+    assert views_that_show(gaussians, few, 2, FitRun()) == ["a0", "b"]
     elsewhere = replace(gaussians, means=gaussians.means + 1e4)
-    assert views_that_show(elsewhere, views, 2) == sorted(views)
+    assert views_that_show(elsewhere, views, 2, FitRun()) == sorted(views)
 
 
 def test_of_three_views_the_near_and_the_opposite_one_are_taken():
@@ -151,7 +175,7 @@ def test_the_fit_reads_the_chosen_views_alone_and_trusts_them_as_all(ring):
     config = BuildConfig(dino="none", averaged=AveragedConfig(sightings=3, segments=False))
     all_views = replace(config, averaged=replace(config.averaged, sightings=0))
     few = Averaged().fit(ring.gaussians, TrainingViews(views, features=maps), config, FitRun())
-    assert read == set(views_that_show(ring.gaussians, views, 3)) < set(views)
+    assert read == set(views_that_show(ring.gaussians, views, 3, FitRun())) < set(views)
     every = Averaged().fit(ring.gaussians, TrainingViews(views, features=maps), all_views, FitRun())
     assert read == set(views)
     # Sums over a part of the views are smaller, which is no reason to trust them less.
@@ -161,10 +185,11 @@ def test_the_fit_reads_the_chosen_views_alone_and_trusts_them_as_all(ring):
 def test_a_choice_is_made_once(ring):
     views = TrainingViews({name: View(camera) for name, camera in ring.cameras.items()})
     config = SimpleNamespace(averaged=AveragedConfig(sightings=3))
-    method, told = Averaged(), []
-    chosen = method.views_to_read(ring.gaussians, views, config, told.append)
-    assert chosen.chosen_from == len(views.views) == told[-1].total
-    assert method.views_to_read(ring.gaussians, chosen, config, told.append) is chosen
+    method, told = Averaged(), list[Event]()
+    run = FitRun(listener=told.append)
+    chosen = method.views_to_read(ring.gaussians, views, config, run)
+    assert chosen.chosen_from == len(views.views) == told[-1].total == told[-1].done
+    assert method.views_to_read(ring.gaussians, chosen, config, run) is chosen
 
 
 @pytest.mark.parametrize(

@@ -418,7 +418,7 @@ class _Builder:
         if not self.method.feature_inputs(self.config):  # no Gaussians are needed to choose
             return views
         gaussians = self.folder.read_gaussians().to(self.device)
-        found = self.method.views_to_read(gaussians, views, self.config, self.listener)
+        found = self.method.views_to_read(gaussians, views, self.config, self._fit_run())
         few, what = (
             len(found.views),
             "features of %d of %d training photos, which show everything often enough",

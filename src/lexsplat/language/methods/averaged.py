@@ -162,18 +162,18 @@ class Averaged:
         return ["reconstruct", config.averaged.sightings] if config.averaged.sightings else []
 
     def views_to_read(
-        self, gaussians: Gaussians, views: TrainingViews, config: Any, listener: Listener
+        self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun
     ) -> TrainingViews:
         """As few as show each Gaussian often enough."""
         if views.chosen_from or not config.averaged.sightings:
             return views
-        names = views_that_show(gaussians, views.views, config.averaged.sightings, listener)
+        names = views_that_show(gaussians, views.views, config.averaged.sightings, run)
         chosen = {name: views.views[name] for name in names}
         return replace(views, views=chosen, chosen_from=len(views.views))
 
     def fit(self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> CodeField:
         """The features of the views to read on each Gaussian, then codes for them."""
-        views = self.views_to_read(gaussians, views, config, run.listener)
+        views = self.views_to_read(gaussians, views, config, run)
         if views.chosen_from:
             config = replace(config, averaged=config.averaged.for_share(len(views.views) / views.chosen_from))
         if len(views.views) >= _TOLD_FROM and not run.workers.distributed:

@@ -121,7 +121,7 @@ class LanguageMethod(Protocol):
         """Inputs of the features in addition to photos and encoders; the name of a stage stands for its inputs."""
 
     def views_to_read(
-        self, gaussians: Gaussians, views: TrainingViews, config: Any, listener: Listener
+        self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun
     ) -> TrainingViews:
         """Those of the training views whose features `fit` needs."""
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,9 +22,11 @@ from numpy.typing import NDArray
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.language.methods.method import FitRun
 from lexsplat.rendering import prepare, weigh_cells
 from lexsplat.runtime.device import threads_for_kernels
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Event
+from lexsplat.runtime.workers import Needs, results
 
 if TYPE_CHECKING:
     from lexsplat.captures import View
@@ -31,14 +34,15 @@ if TYPE_CHECKING:
 ENOUGH_ONCE, ENOUGH = 0.999, 0.95
 """Shares of the wanted sightings at which no further view is taken: of one for every Gaussian, and of all."""
 _LONG_SIDE = 120
-_SAMPLE = 16_384
+_SAMPLE, _FEWER, _MOST_NUMBERS = 16_384, 2_048, 1 << 26
+"""Gaussians that are looked at; at least so many where the views are many, whose weights are 128 MB then."""
 _LEAST = 0.01
 """Least weight of a Gaussian in some view, in pixels of 120 along the longer side; others are too small to tell."""
+_VIEWS_OF_A_TASK = 16
 
 
-@threads_for_kernels()
 def views_that_show(
-    gaussians: Gaussians, views: Mapping[str, View], sightings: int, listener: Listener = silent
+    gaussians: Gaussians, views: Mapping[str, View], sightings: int, run: FitRun
 ) -> list[str]:
     """Names of views that show nearly every Gaussian `sightings` times, or as often as all views do; sorted.
 
@@ -46,20 +50,39 @@ def views_that_show(
         gaussians: The geometry.
         views: Views to choose from; masked pixels show nothing.
         sightings: Wanted sightings of each Gaussian, at least 1.
-        listener: Receives events of stage "views to read".
+        run: Its listener receives events of stage "views to read". The result does not depend on its workers.
     """
-    names = sorted(views)
-    if len(names) <= sightings:
+    names, count = sorted(views), len(gaussians)
+    if len(names) <= sightings or not count:
         return names
-    gaussians = gaussians.detach()
-    sample = np.unique(np.linspace(0, len(gaussians) - 1, min(_SAMPLE, len(gaussians))).astype(np.int64))
-    weights = np.zeros((len(names), len(sample)), np.float16)
-    listener(Event("views to read", 0, len(names)))
-    with torch.no_grad():
-        for row, name in enumerate(names):
-            weights[row] = np.minimum(_weights(gaussians, views[name])[sample], np.finfo(np.float16).max)
-            listener(Event("views to read", row + 1, len(names)))
-    return [names[row] for row in covering(weights, sightings)] or names
+    taken = min(count, max(_FEWER, min(_SAMPLE, _MOST_NUMBERS // len(names))))
+    sample = np.unique(np.linspace(0, count - 1, taken).astype(np.int64))
+    size = _VIEWS_OF_A_TASK if run.workers.distributed else 1
+    tasks = {names[start]: tuple(names[start : start + size]) for start in range(0, len(names), size)}
+    shared = _Weighed(gaussians.detach(), views, sample)
+    needs = Needs(gpu=gaussians.device.type == "cuda", result=2 * size * len(sample))
+    rows: list[NDArray[np.float16]] = []
+    run.listener(Event("views to read", 0, len(names)))
+    for found in results(run.workers.map(_weights_of, shared, tasks, needs)):
+        rows.append(found)
+        run.listener(Event("views to read", sum(map(len, rows)), len(names), run.workers.metrics))
+    return [names[row] for row in covering(np.concatenate(rows), sightings)] or names
+
+
+@dataclass(frozen=True)
+class _Weighed:
+    """Inputs of the tasks: what is looked at."""
+
+    gaussians: Gaussians
+    views: Mapping[str, View]
+    sample: NDArray[np.int64]
+
+
+@threads_for_kernels()
+def _weights_of(shared: _Weighed, names: tuple[str, ...]) -> NDArray[np.float16]:
+    """Weight of each Gaussian of the sample in some views ``[v, n]``, in pixels of small images of them."""
+    rows = [_weights(shared.gaussians, shared.views[name])[shared.sample] for name in names]
+    return np.stack(rows).clip(max=np.finfo(np.float16).max).astype(np.float16)
 
 
 def _weights(gaussians: Gaussians, view: View) -> NDArray[np.float32]:
@@ -67,9 +90,10 @@ def _weights(gaussians: Gaussians, view: View) -> NDArray[np.float32]:
     camera: Camera = view.camera.within(_LONG_SIDE)
     valid = view.load_valid((camera.width, camera.height))
     counts = torch.ones(camera.height, camera.width) if valid is None else torch.from_numpy(valid).float()
-    prepared = prepare(gaussians, camera)
-    found = weigh_cells(gaussians, camera, (1, 1), counts.to(gaussians.device), prepared)
-    return np.asarray(found.totals().cpu().numpy())
+    with torch.no_grad():
+        prepared = prepare(gaussians, camera)
+        found = weigh_cells(gaussians, camera, (1, 1), counts.to(gaussians.device), prepared)
+        return np.asarray(found.totals().cpu().numpy())
 
 
 def covering(weights: NDArray[np.floating], sightings: float) -> list[int]:

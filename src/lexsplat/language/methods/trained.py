@@ -59,7 +59,7 @@ class Trained:
         return []
 
     def views_to_read(
-        self, gaussians: Gaussians, views: TrainingViews, config: Any, listener: Listener
+        self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun
     ) -> TrainingViews:
         """All of them."""
         return views
