@@ -34,8 +34,11 @@ class View:
     def __init__(self, camera, valid=None):
         self.camera, self.valid = camera, valid
 
+    def valid_share(self, size):
+        return None if self.valid is None else np.full(size[::-1], self.valid, np.float32)
+
     def load_valid(self, size):
-        return None if self.valid is None else np.full(size[::-1], self.valid)
+        return None if self.valid is None else np.full(size[::-1], self.valid > 0.999)
 
 
 @pytest.fixture(scope="module")
@@ -60,26 +63,74 @@ def two_places():
     return gaussians, {**{f"a{i}": view for i, view in enumerate(first)}, "b": second}
 
 
+def names(gaussians, views, sightings, run=None):
+    return views_that_show(gaussians, views, sightings, run or FitRun())[0]
+
+
 def test_a_place_that_one_view_shows_is_read_and_a_place_that_many_show_is_read_in_some(two_places):
     gaussians, views = two_places
-    chosen = views_that_show(gaussians, views, 2, FitRun())
+    chosen = names(gaussians, views, 2)
     assert "b" in chosen
     assert 2 <= len(chosen) - 1 < 8
-    assert len(views_that_show(gaussians, views, 4, FitRun())) > len(chosen)
+    assert len(names(gaussians, views, 4)) > len(chosen)
 
 
 def test_masked_views_show_nothing(two_places):
     gaussians, views = two_places
-    chosen = views_that_show(gaussians, views, 2, FitRun())
+    chosen = names(gaussians, views, 2)
     masked = {name: View(view.camera, valid=name not in chosen[:1]) for name, view in views.items()}
-    assert chosen[0] not in views_that_show(gaussians, masked, 2, FitRun())
+    assert chosen[0] not in names(gaussians, masked, 2)
+
+
+def test_half_masked_views_are_chosen_as_whole_ones(two_places):
+    """A small pixel counts by its share that is not masked: thin masks leave no view without a pixel."""
+    gaussians, views = two_places
+    masked = {name: View(view.camera, valid=0.5) for name, view in views.items()}
+    assert "b" in names(gaussians, masked, 2)
+    assert len(names(gaussians, masked, 2)) < len(views)
+
+
+def test_gaussians_without_the_mip_filter_are_drawn_with_it(two_places):
+    """A small image makes them too large otherwise, and so far views too good."""
+    gaussians, views = two_places
+    plain, filtered = (replace(gaussians, antialiased=mip) for mip in (False, True))
+    assert names(plain, views, 3) == names(filtered, views, 3)
+    np.testing.assert_array_equal(*(views_that_show(g, views, 3, FitRun())[1] for g in (plain, filtered)))
+
+
+def test_the_shares_are_those_of_the_weight_in_all_views(two_places):
+    gaussians, views = two_places
+    chosen, shares = views_that_show(gaussians, views, 2, FitRun())
+    hidden = shares[200:] == len(chosen) / len(views)
+    assert bool(((shares[200:] == 1) | hidden).all()), "one view shows them, and it is read"
+    assert float(hidden.float().mean()) < 0.1
+    of_first_place = (len(chosen) - 1) / 8
+    assert float(shares[:200].mean()) == pytest.approx(of_first_place, rel=0.3)
+    assert float(shares.min()) >= len(chosen) / len(views) / 2
+
+
+def test_a_place_that_is_shown_once_is_trusted_as_before(two_places):
+    gaussians, views = two_places
+    maps = {name: FeatureMap(normalize(torch.ones(48, 64, 4), dim=-1)) for name in views}
+    found = [
+        Averaged()
+        .fit(
+            gaussians,
+            TrainingViews(views, features=maps),
+            BuildConfig(dino="none", averaged=AveragedConfig(sightings=number, segments=False)),
+            FitRun(),
+        )
+        .uncertainties[200:]
+        for number in (0, 2)
+    ]
+    torch.testing.assert_close(*found)
 
 
 def test_the_choice_does_not_depend_on_the_order_of_the_views(two_places):
     gaussians, views = two_places
     backwards = dict(reversed(views.items()))
-    chosen = views_that_show(gaussians, views, 2, FitRun())
-    assert views_that_show(gaussians, backwards, 2, FitRun()) == chosen
+    chosen = names(gaussians, views, 2)
+    assert names(gaussians, backwards, 2) == chosen
 
 
 def test_the_choice_does_not_depend_on_workers(two_places, tmp_path):
@@ -87,28 +138,28 @@ def test_the_choice_does_not_depend_on_workers(two_places, tmp_path):
     (tmp_path / "scene").mkdir()
     workers, told = BlindWorkers(tmp_path / "scene"), list[Event]()
     run = FitRun(workers=workers, listener=told.append)
-    assert views_that_show(gaussians, views, 2, run) == views_that_show(gaussians, views, 2, FitRun())
-    assert (workers.tasks, told[-1].done, told[-1].total) == (1, 9, 9)
+    assert names(gaussians, views, 2, run) == names(gaussians, views, 2)
+    assert workers.tasks == 2, "sixteen views a task: of all views, and of the chosen ones"
+    assert (told[-1].done, told[-1].total) == (9, 9)
 
 
 def test_many_views_are_compared_by_fewer_gaussians(two_places, monkeypatch):
     gaussians, views = two_places
     monkeypatch.setattr(sightings_module, "_MOST_NUMBERS", 9 * 100)
-    monkeypatch.setattr(sightings_module, "_FEWER", 50)
     shapes = []
     monkeypatch.setattr(
         sightings_module, "covering", lambda weights, wish: shapes.append(weights.shape) or [0]
     )
-    assert views_that_show(gaussians, views, 2, FitRun()) == ["a0"]
+    assert names(gaussians, views, 2) == ["a0"]
     assert shapes == [(9, 100)]
 
 
 def test_all_views_are_read_where_they_are_few_or_show_nothing(two_places):
     gaussians, views = two_places
     few = {name: views[name] for name in ("b", "a0")}
-    assert views_that_show(gaussians, few, 2, FitRun()) == ["a0", "b"]
+    assert names(gaussians, few, 2) == ["a0", "b"]
     elsewhere = replace(gaussians, means=gaussians.means + 1e4)
-    assert views_that_show(elsewhere, views, 2, FitRun()) == sorted(views)
+    assert names(elsewhere, views, 2) == sorted(views)
 
 
 def test_of_three_views_the_near_and_the_opposite_one_are_taken():
@@ -146,13 +197,16 @@ def by_definition(weights, sightings):
 
 @settings(max_examples=60)
 @given(
-    arrays(np.int64, st.tuples(st.integers(1, 9), st.integers(1, 12)), elements=st.integers(0, 8)),
+    arrays(
+        float,
+        st.tuples(st.integers(1, 9), st.integers(1, 12)),
+        elements=st.sampled_from([0.0, 1.0, 2.0, 4.0, 8.0]),  # whose quotients and sums are exact
+    ),
     st.integers(1, 4),
 )
-def test_the_choice_is_the_greedy_one_and_shows_nearly_all_that_all_views_show(counts, sightings):
-    weights = counts.astype(float)
-    chosen, expected = covering(weights, sightings), by_definition(weights, sightings)
-    assert len(chosen) == len(expected)  # of equal views, either may be taken
+def test_the_choice_is_the_greedy_one_and_shows_nearly_all_that_all_views_show(weights, sightings):
+    chosen = covering(weights.copy(), sightings)
+    assert chosen == sorted(by_definition(weights, sightings))
     shown = weights[:, weights.max(0) > 0]
     parts = shown / shown.max(0)
     wanted = np.minimum(parts.sum(0), sightings).sum()
@@ -175,11 +229,11 @@ def test_the_fit_reads_the_chosen_views_alone_and_trusts_them_as_all(ring):
     config = BuildConfig(dino="none", averaged=AveragedConfig(sightings=3, segments=False))
     all_views = replace(config, averaged=replace(config.averaged, sightings=0))
     few = Averaged().fit(ring.gaussians, TrainingViews(views, features=maps), config, FitRun())
-    assert read == set(views_that_show(ring.gaussians, views, 3, FitRun())) < set(views)
+    assert read == set(names(ring.gaussians, views, 3)) < set(views)
     every = Averaged().fit(ring.gaussians, TrainingViews(views, features=maps), all_views, FitRun())
     assert read == set(views)
     # Sums over a part of the views are smaller, which is no reason to trust them less.
-    assert float((few.uncertainties - every.uncertainties).abs().mean()) < 0.05
+    assert abs(float((few.uncertainties - every.uncertainties).mean())) < 0.02
 
 
 def test_a_choice_is_made_once(ring):
@@ -188,7 +242,7 @@ def test_a_choice_is_made_once(ring):
     method, told = Averaged(), list[Event]()
     run = FitRun(listener=told.append)
     chosen = method.views_to_read(ring.gaussians, views, config, run)
-    assert chosen.chosen_from == len(views.views) == told[-1].total == told[-1].done
+    assert told[-1].total == told[-1].done == len(views.views) > len(chosen.views)
     assert method.views_to_read(ring.gaussians, chosen, config, run) is chosen
 
 
@@ -209,6 +263,8 @@ def test_the_bundled_encoders_need_fewer_sightings_than_any_other(given_settings
 def test_features_of_another_program_are_all_read(tmp_path, monkeypatch):
     monkeypatch.setattr("lexsplat.pipeline.config.patch_grid", lambda name: 14)
     assert BuildConfig(features_from=tmp_path).resolved("cpu", (640, 480)).averaged.sightings == 0
+    with pytest.raises(ValueError, match=r"leave --averaged\.sightings out"):
+        BuildConfig(features_from=tmp_path, averaged=AveragedConfig(sightings=8))
 
 
 def test_a_negative_number_of_sightings_is_refused():

@@ -8,6 +8,7 @@ import weakref
 from dataclasses import replace
 
 import pytest
+import torch
 from support import color_encoder
 from support.experiments import CONFIG
 
@@ -119,9 +120,10 @@ def test_a_changed_setting_redoes_what_depends_on_it(
 
 
 def test_features_are_made_of_the_chosen_photos_and_later_of_the_others(six_views, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "lexsplat.language.methods.averaged.views_that_show", lambda gaussians, views, *_: sorted(views)[:3]
-    )
+    def first_three(gaussians, views, *_):
+        return sorted(views)[:3], torch.full((len(gaussians),), 0.75)
+
+    monkeypatch.setattr("lexsplat.language.methods.averaged.views_that_show", first_three)
 
     def photos_with_features(sightings):
         config = replace(AVERAGED, averaged=AveragedConfig(sightings=sightings))

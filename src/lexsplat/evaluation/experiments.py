@@ -150,6 +150,8 @@ class Bench:
         # Features are shared by methods that use DINO and others that do not, so they are made with both encoders.
         with_dino: Any = next(name for name, method in METHODS.items() if method.uses_dino(config))
         every = config if METHODS[config.method].uses_dino(config) else replace(config, method=with_dino)
+        # Other methods read all photos.
+        every = replace(every, averaged=replace(every.averaged, sightings=0))
         self.folder = build(source, output / "scene", every, until="features", listener=listener)
         self.device = choose_device(config.device)
         self.capture = reload_capture(self.folder)

@@ -21,6 +21,7 @@ from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebo
 from lexsplat.features import FeatureMaps, check_external_features, read_external_features
 from lexsplat.language.code_maps import MaskedCodeMaps, mark_masked_cells
 from lexsplat.language.methods import FitRun, TrainingViews
+from lexsplat.pipeline.chosen_views import choice_path, kept_choice, views_to_read
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.distribution import extract_on_workers
 from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps, fetch_clip
@@ -57,7 +58,7 @@ from lexsplat.runtime.errors import (
 )
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.runtime.progress import NOTE, Event, Listener, kept_warnings, silent, warn_again
+from lexsplat.runtime.progress import Event, Listener, kept_warnings, silent, warn_again
 from lexsplat.runtime.training import Checkpoint
 from lexsplat.runtime.workers import IN_PROCESS, SharedFolder, Workers, open_workers
 from lexsplat.scenes.folder import SceneFolder
@@ -255,6 +256,7 @@ class _Builder:
             *self.method.feature_inputs(config),
         ]
         own_features = [] if config.features_from is not None else [folder.features_path]
+        own_features += [choice_path(folder)] if self.method.feature_inputs(config) else []
         language = ["reconstruct", self.method.needs[-1], method_settings, config.seed]
         geometry = [capture_hash, *self.geometry.inputs(config, self.device)]
         own_geometry = [folder.gaussians_path, *self.geometry.outputs(self._checkpoints)]
@@ -309,6 +311,8 @@ class _Builder:
         facts, warnings = self._with_whole_features(stage.work)
         if name == "reconstruct" and self.folder.record.get("checksums") != before:
             self.folder.reopen("language")  # made for other Gaussians, even where all settings are the same
+            if self.method.feature_inputs(self.config):
+                self.folder.reopen("features")
         seconds = self.checkpoint.seconds_before + time.perf_counter() - start
         self.folder.finish(name, key, seconds, **facts, **({"warnings": warnings} if warnings else {}))
         record_warnings(self.folder, self.capture)
@@ -373,11 +377,11 @@ class _Builder:
         return code_usage(code_maps.values(), codebook.num_codes).facts()
 
     def _fit_language(self) -> dict[str, Any]:
-        gaussians = self.folder.read_gaussians().to(self.device)
         if "codebook" in self.method.needs:
             views = self._views_with_codes()
         else:
             views = replace(self._views_to_read, features=self._feature_maps())
+        gaussians = self.folder.read_gaussians().to(self.device)
         field = self.method.fit(gaussians, views, self.config, self._fit_run())
         field.method = self.method.name
         metadata = {**field.metadata(), "reconstruction": self.fingerprints["reconstruct"]}
@@ -413,19 +417,12 @@ class _Builder:
 
     @cached_property
     def _views_to_read(self) -> TrainingViews:
-        """The training views whose features the method needs."""
-        views = TrainingViews(self._training_views)
-        if not self.method.feature_inputs(self.config):  # no Gaussians are needed to choose
-            return views
-        gaussians = self.folder.read_gaussians().to(self.device)
-        found = self.method.views_to_read(gaussians, views, self.config, self._fit_run())
-        few, what = (
-            len(found.views),
-            "features of %d of %d training photos, which show everything often enough",
-        )
-        if few < len(views.views):
-            log.log(NOTE, what, few, len(views.views))
-        return found
+        """The training views whose features the method needs: those of the stage "features" where it is finished."""
+        views, method = self._training_views, self.method
+        kept = None
+        if method.feature_inputs(self.config) and "features" in self.folder.record["stages"]:
+            kept = kept_choice(self.folder, views)
+        return kept or views_to_read(method, self.folder, views, self.config, self.device, self._fit_run())
 
     @property
     def _training_views(self) -> dict[str, View]:

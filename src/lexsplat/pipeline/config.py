@@ -78,7 +78,7 @@ class BuildConfig:
             are many.
         views_from: From where splats without a capture are looked at: from "inside" a room, or from "around" an
             object; by default what they seem to be.
-        method: "averaged" puts the features of all views on each Gaussian and quantizes them there (the best in
+        method: "averaged" puts the features of views on each Gaussian and quantizes them there (the best in
             docs/results.md); "trained" is the optimization of the paper.
         joint: Train language together with geometry, as in the paper; needs method "trained".
         as_in_paper: Build and ask as the paper describes it (docs/paper.md): method "trained", jointly, 30,000 steps
@@ -152,6 +152,8 @@ class BuildConfig:
             raise ValueError(
                 "features of another program are used as they are: leave --features.segments out"
             )
+        if self.features_from is not None and self.averaged.sightings:
+            raise ValueError("features of another program are all read: leave --averaged.sightings out")
         if self.frames < 3:
             raise ValueError(f"frames must be at least 3, got {self.frames}")
         if self.up is not None:

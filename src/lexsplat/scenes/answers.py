@@ -174,8 +174,8 @@ def answer_queries(
         QueryError: If a prompt is empty, a view is unknown, or the threshold is not in 0..1.
     """
     names = [scene.view(name).name for name in views] or default_views(scene)
-    compile_drawing(scene.gaussians.device, scene.listener)
     found = scene.ask(prompts, threshold)
+    compile_drawing(scene.gaussians.device, scene.listener)
     thresholds = found.thresholds.tolist()
     answers: list[dict[str, Any]] = [
         {

@@ -1,9 +1,10 @@
-"""Method "averaged", the default: the features of all views on each Gaussian first, codes afterwards.
+"""Method "averaged", the default: the features of views on each Gaussian first, codes afterwards.
 
 The paper quantizes the features of every view and then puts the codes on the Gaussians. Small parts such as a mug's
 handle cover too few cells to receive one of the codewords and are lost before the views are combined. This method
 reverses the order. The weight alpha T with which Gaussian n is blended into a pixel is its share of that pixel's
-feature, so its own feature is the weighted mean over all pixels of all training views,
+feature, so its own feature is the weighted mean over all pixels of the training views that are read (as few as show
+everything often enough, `lexsplat.language.methods.sightings`),
 
     F_n = sum alpha T F(p) / sum alpha T,
 
@@ -85,7 +86,7 @@ class AveragedConfig:
             never seen, in 0..1.
         squared: Square the weights of the mean.
         agreement: Weigh each feature by exp(agreement (cos - 1)), where cos compares it with the Gaussian's mean over
-            all views, in a second pass over them; in 0..30. 0 takes the mean of the first.
+            the views, in a second pass over them; in 0..30. 0 takes the mean of the first.
         sightings: Views are read until nearly every Gaussian is shown so often by them, or as often as by all views
             (`lexsplat.language.methods.sightings`). 0 reads all views. By default a build takes 8, and 4 with the
             bundled encoders.
@@ -120,11 +121,6 @@ class AveragedConfig:
             raise ValueError(f"sightings must not be negative, got {self.sightings}")
         if not 0 <= self.agreement <= 30:  # beyond, weights vanish in float32
             raise ValueError(f"agreement must be in 0..30, got {self.agreement:g}")
-
-    def for_share(self, share: float) -> AveragedConfig:
-        """The same if only a share of the training views is read: sums of weights are that much smaller."""
-        visibility, prior = share * self.min_visibility, share * self.prior_visibility
-        return replace(self, min_visibility=visibility, prior_visibility=prior)
 
     @property
     def weighs_entries(self) -> bool:
@@ -165,21 +161,20 @@ class Averaged:
         self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun
     ) -> TrainingViews:
         """As few as show each Gaussian often enough."""
-        if views.chosen_from or not config.averaged.sightings:
+        if views.shares is not None or not config.averaged.sightings:
             return views
-        names = views_that_show(gaussians, views.views, config.averaged.sightings, run)
-        chosen = {name: views.views[name] for name in names}
-        return replace(views, views=chosen, chosen_from=len(views.views))
+        names, shares = views_that_show(gaussians, views.views, config.averaged.sightings, run)
+        return replace(views, views={name: views.views[name] for name in names}, shares=shares)
 
     def fit(self, gaussians: Gaussians, views: TrainingViews, config: Any, run: FitRun) -> CodeField:
         """The features of the views to read on each Gaussian, then codes for them."""
         views = self.views_to_read(gaussians, views, config, run)
-        if views.chosen_from:
-            config = replace(config, averaged=config.averaged.for_share(len(views.views) / views.chosen_from))
         if len(views.views) >= _TOLD_FROM and not run.workers.distributed:
             amount = f"{len(views.views):,} views and {len(gaussians):,} Gaussians"
             tell("language", _forecast(gaussians, views, config, run), amount)
         found = _means(gaussians, views, views.cameras, config, run)
+        if views.shares is not None:  # weights as all training views have them, which visibility is told by
+            found = replace(found, totals=found.totals / views.shares.to(found.totals.device))
         field = _with_language(gaussians, found, config.codebook, config.averaged, run)
         if config.averaged.reliability:
             _doubt_features(field, found.totals * found.visible(config.averaged))

@@ -21,6 +21,8 @@ from lexsplat.runtime.progress import Listener, silent
 from lexsplat.runtime.workers import IN_PROCESS, Workers
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from lexsplat.language.methods.joint import JointTrainer
     from lexsplat.reconstruction import Reconstructor
     from lexsplat.runtime.training import Checkpoint
@@ -38,15 +40,15 @@ class TrainingViews:
         features: Dense features by view name, for methods that need the stage "features" only.
         code_maps: Index maps ``[h, w]`` by view name, for methods that need the stage "codebook".
         codebook: The discrete feature space S of the index maps.
-        chosen_from: Number of training views of the capture where these are some of them
-            (`LanguageMethod.views_to_read`); 0 if nothing was chosen yet.
+        shares: Share of each Gaussian's weight over all training views that these have ``[N]``, where they are chosen
+            (`LanguageMethod.views_to_read`); None if nothing was chosen yet.
     """
 
     views: Mapping[str, View]
     features: Mapping[str, FeatureMap] | None = None
     code_maps: Mapping[str, NDArray[np.integer]] | None = None
     codebook: Codebook | None = None
-    chosen_from: int = 0
+    shares: Tensor | None = None
 
     @property
     def cameras(self) -> dict[str, Camera]:

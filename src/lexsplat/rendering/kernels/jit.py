@@ -91,7 +91,7 @@ def announce() -> None:
     global _announced
     if not _announced:
         _announced = True
-        logger.log(NOTE, "compiling CPU kernels, once (about 20 seconds)")
+        logger.log(NOTE, "compiling CPU kernels, once for this machine")
 
 
 class _Announcer(event.Listener):

@@ -279,7 +279,7 @@ class Library:
             yield
 
     def _sweep(self) -> None:
-        """Finish removals, and delete files of earlier versions of scenes; files without a record stay."""
+        """Finish removals, and delete files of earlier versions of scenes; codes without a record stay."""
         marks = removals(self.stage)
         leaving = {name for name, path in marks.items() if not path.with_suffix(".json").exists()}
         whole = (each for each in self.records() if all((self.stage / file).exists() for file in each.files))
