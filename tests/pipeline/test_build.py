@@ -136,6 +136,36 @@ def test_features_are_made_of_the_chosen_photos_and_later_of_the_others(six_view
     assert photos_with_features(0) == (4, 4, 4)
 
 
+def test_a_choice_of_photos_is_kept_as_long_as_the_gaussians(
+    built_by_method, six_views, tmp_path, monkeypatch, caplog
+):
+    copy = shutil.copytree(built_by_method / "averaged", tmp_path / "copy")
+    choices = []
+
+    def first_three(gaussians, views, *_):
+        choices.append(len(gaussians))
+        return sorted(views)[:3], torch.full((len(gaussians),), 0.75)
+
+    monkeypatch.setattr("lexsplat.language.methods.averaged.views_that_show", first_three)
+    other = replace(AVERAGED, averaged=AveragedConfig(top=3))
+    assert stages_run(six_views, copy, other) == {"reconstruct": True, "features": True, "language": False}
+    assert choices == [], "the stage features is finished"
+    (copy / "checkpoints" / "views_to_read.safetensors").unlink()
+    assert not stages_run(six_views, copy, other)["features"]
+    assert len(choices) == 1
+    write = SceneFolder.write_gaussians
+    monkeypatch.setattr(  # other Gaussians, as of a GPU whose sums are in another order
+        SceneFolder,
+        "write_gaussians",
+        lambda self, made: write(self, made.select(torch.arange(1, len(made)))),
+    )
+    (copy / "gaussians.ply").unlink()
+    finished = stages_run(six_views, copy, other)
+    assert finished == dict.fromkeys(finished, False)
+    assert len(choices) == 2
+    assert choices[1] < choices[0]
+
+
 def test_a_missing_result_is_made_again(built_by_method, six_views, tmp_path):
     copy = shutil.copytree(built_by_method / "averaged", tmp_path / "copy")
     (copy / "language.safetensors").unlink()

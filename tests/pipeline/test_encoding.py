@@ -1,5 +1,6 @@
 """The encoders of a build: loaded when used, once, and looked for before the work begins."""
 
+import dataclasses
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -132,5 +133,24 @@ def test_a_forecast_of_less_than_two_seconds_is_left_out(
     config = BuildConfig(clip=str(clip_folder), dino="none").resolved("cpu", (96, 72))
     with caplog.at_level(NOTE, logger="lexsplat"):
         encoders = check_encoders(config, tmp_path, 3)
-    assert sum("for 3 training photos" in message for message in caplog.messages) == expected
+    assert (
+        sum("at most" in message and "for 3 training photos" in message for message in caplog.messages)
+        == expected
+    )
     assert encoders.told, "the extraction does not measure it again"
+
+
+@pytest.mark.slow
+def test_the_time_is_told_again_when_fewer_photos_are_chosen(tiny_capture, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(encoding, "estimate", lambda *_: pytest.fail("it is measured"))
+    capture = load_capture(tiny_capture)
+    small = FeatureConfig(crop_sizes=(0.5,), crop_strides=(0.5,), map_cells=8, max_short_side=24)
+    config = BuildConfig(clip="bundled", dino="none", features=small).resolved("cpu", (96, 72))
+    encoders = Encoders.of(config)
+    encoders.estimate, encoders.told = Estimate(7, 2.0), 100
+    few = dataclasses.replace(
+        capture, views=dict(list(capture.views.items())[:2]), train_names=(), test_names=()
+    )
+    with caplog.at_level(NOTE, logger="lexsplat"):
+        feature_maps(few, config, encoders, tmp_path)
+    assert [message.split("; ")[1] for message in caplog.messages] == ["0:04 min for 2 training photos"]
