@@ -106,7 +106,8 @@ def test_every_file_is_written_after_every_run_and_both_commands_keep_their_own(
 @pytest.mark.slow
 def test_crop_sizes_of_features_of_another_program_are_refused(open_bench, tmp_path):
     bench = open_bench()
-    bench.config = replace(bench.config, features_from=tmp_path)
+    averaged = replace(bench.config.averaged, sightings=0)
+    bench.config = replace(bench.config, averaged=averaged, features_from=tmp_path)
     with pytest.raises(CaptureError, match="several crop sizes"):
         bench.level_maps("view_01.png")
 
