@@ -310,9 +310,10 @@ class _Builder:
         before = self.folder.record.get("checksums")
         facts, warnings = self._with_whole_features(stage.work)
         if name == "reconstruct" and self.folder.record.get("checksums") != before:
-            self.folder.reopen("language")  # made for other Gaussians, even where all settings are the same
-            if self.method.feature_inputs(self.config):
-                self.folder.reopen("features")
+            for later in ("language", *(["features"] if self.method.feature_inputs(self.config) else [])):
+                self.folder.record["stages"].pop(
+                    later, None
+                )  # of other Gaussians, even with the same settings
         seconds = self.checkpoint.seconds_before + time.perf_counter() - start
         self.folder.finish(name, key, seconds, **facts, **({"warnings": warnings} if warnings else {}))
         record_warnings(self.folder, self.capture)

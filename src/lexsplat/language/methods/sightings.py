@@ -84,7 +84,8 @@ def views_that_show(
     usual = len(chosen) / len(names)
     shares = np.where(possible > 0, found / np.maximum(possible, 1e-12), usual)
     # What the chosen views hardly show is not trusted as if all views had been read.
-    return chosen, torch.from_numpy(shares.clip(usual / 2, 1).astype(np.float32)).to(gaussians.device)
+    rounded = shares.clip(usual / 2, 1).astype(np.float16).astype(np.float32)  # as they are kept
+    return chosen, torch.from_numpy(rounded).to(gaussians.device)
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def _weigh(
     shared: _Weighed, names: Sequence[str], run: FitRun
 ) -> Iterator[tuple[NDArray[np.float16], NDArray[np.float32]]]:
     """The results of `_weights_of` for all names, in order."""
-    size = _VIEWS_OF_A_TASK if run.workers.distributed else 1
+    size = _VIEWS_OF_A_TASK  # also without workers: the order of a sum decides its last bit
     tasks = {names[start]: tuple(names[start : start + size]) for start in range(0, len(names), size)}
     gaussians = shared.gaussians
     nbytes = 2 * size * len(shared.sample) + 4 * len(gaussians)
