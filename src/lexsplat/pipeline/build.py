@@ -311,9 +311,9 @@ class _Builder:
         facts, warnings = self._with_whole_features(stage.work)
         if name == "reconstruct" and self.folder.record.get("checksums") != before:
             for later in ("language", *(["features"] if self.method.feature_inputs(self.config) else [])):
-                self.folder.record["stages"].pop(
-                    later, None
-                )  # of other Gaussians, even with the same settings
+                # Made for other Gaussians, even where all settings are the same.
+                self.folder.record["stages"].pop(later, None)
+            self.folder.save()
         seconds = self.checkpoint.seconds_before + time.perf_counter() - start
         self.folder.finish(name, key, seconds, **facts, **({"warnings": warnings} if warnings else {}))
         record_warnings(self.folder, self.capture)
