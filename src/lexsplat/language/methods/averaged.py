@@ -173,7 +173,8 @@ class Averaged:
             amount = f"{len(views.views):,} views and {len(gaussians):,} Gaussians"
             tell("language", _forecast(gaussians, views, config, run), amount)
         found = _means(gaussians, views, views.cameras, config, run)
-        if views.shares is not None:  # weights as all training views have them, which visibility is told by
+        if views.shares is not None:
+            # Visibility is measured over all training views, so their weights are estimated from those that are read.
             found = replace(found, totals=found.totals / views.shares.to(found.totals.device))
         field = _with_language(gaussians, found, config.codebook, config.averaged, run)
         if config.averaged.reliability:
