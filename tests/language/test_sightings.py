@@ -141,7 +141,20 @@ def test_the_choice_does_not_depend_on_workers(two_places, tmp_path):
     run = FitRun(workers=workers, listener=told.append)
     assert names(gaussians, views, 2, run) == names(gaussians, views, 2)
     assert workers.tasks == 2, "sixteen views a task: of all views, and of the chosen ones"
-    assert (told[-1].done, told[-1].total) == (9, 9)
+    ends = [(event.stage, event.total) for event in told if event.done == event.total]
+    assert ends == [("views to read", 9), ("sightings", len(names(gaussians, views, 2)))]
+
+
+def test_sums_over_several_tasks_have_the_same_bits_with_workers(two_places, tmp_path):
+    gaussians, _ = two_places
+    views = {f"{i:02}": view for i, view in enumerate(looking_at(np.zeros(3), np.linspace(0, 6, 40)))}
+    (tmp_path / "scene").mkdir()
+    workers = BlindWorkers(tmp_path / "scene")
+    found, shares = views_that_show(gaussians, views, 20, FitRun(workers=workers))
+    assert workers.tasks >= 3 + 2
+    alone, expected = views_that_show(gaussians, views, 20, FitRun())
+    assert found == alone
+    assert torch.equal(shares, expected)
 
 
 def test_many_views_are_compared_by_fewer_gaussians(two_places, monkeypatch):
@@ -243,7 +256,7 @@ def test_a_choice_is_made_once(ring):
     method, told = Averaged(), list[Event]()
     run = FitRun(listener=told.append)
     chosen = method.views_to_read(ring.gaussians, views, config, run)
-    assert told[-1].total == told[-1].done == len(views.views) > len(chosen.views)
+    assert told[-1].total == told[-1].done == len(chosen.views) < len(views.views)
     assert method.views_to_read(ring.gaussians, chosen, config, run) is chosen
 
 

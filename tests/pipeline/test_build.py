@@ -18,6 +18,7 @@ from lexsplat.language.methods.trained import Trained, TrainedConfig
 from lexsplat.pipeline import build as pipeline
 from lexsplat.pipeline import geometry
 from lexsplat.pipeline.build import STAGES, build
+from lexsplat.runtime.files import read_tensors
 from lexsplat.runtime.memory import parse_bytes
 from lexsplat.scenes.folder import SceneFolder
 from lexsplat.scenes.scene import open_scene
@@ -153,17 +154,53 @@ def test_a_choice_of_photos_is_kept_as_long_as_the_gaussians(
     (copy / "checkpoints" / "views_to_read.safetensors").unlink()
     assert not stages_run(six_views, copy, other)["features"]
     assert len(choices) == 1
-    write = SceneFolder.write_gaussians
-    monkeypatch.setattr(  # other Gaussians, as of a GPU whose sums are in another order
-        SceneFolder,
-        "write_gaussians",
-        lambda self, made: write(self, made.select(torch.arange(1, len(made)))),
-    )
+    make_other_gaussians(monkeypatch)
     (copy / "gaussians.ply").unlink()
     finished = stages_run(six_views, copy, other)
     assert finished == dict.fromkeys(finished, False)
     assert len(choices) == 2
     assert choices[1] < choices[0]
+
+
+@pytest.mark.parametrize(("cached", "told"), [(True, 0), (False, 4)])
+def test_no_time_is_told_beforehand_for_photos_whose_features_may_be_there(
+    built_by_method, six_views, tmp_path, monkeypatch, cached, told
+):
+    copy = shutil.copytree(built_by_method / "averaged", tmp_path / "copy")
+    if not cached:
+        shutil.rmtree(copy / "features")
+    counts, check = [], pipeline.check_encoders
+
+    def counted(config, source, photos, *arguments):
+        counts.append(photos)
+        return check(config, source, photos, *arguments)
+
+    monkeypatch.setattr(pipeline, "check_encoders", counted)
+    build(six_views, copy, replace(AVERAGED, averaged=AveragedConfig(sightings=0)))
+    assert counts == [told]
+
+
+def make_other_gaussians(monkeypatch):
+    """One fewer, as of a GPU whose sums are in another order."""
+    write = SceneFolder.write_gaussians
+    monkeypatch.setattr(
+        SceneFolder,
+        "write_gaussians",
+        lambda self, made: write(self, made.select(torch.arange(1, len(made)))),
+    )
+
+
+def test_gaussians_made_for_another_method_have_a_choice_of_their_own(
+    built_by_method, six_views, tmp_path, monkeypatch
+):
+    copy = shutil.copytree(built_by_method / "averaged", tmp_path / "copy")
+    choice = copy / "checkpoints" / "views_to_read.safetensors"
+    make_other_gaussians(monkeypatch)
+    (copy / "gaussians.ply").unlink()
+    assert stages_run(six_views, copy, TRAINED, until="reconstruct") == {"reconstruct": False}
+    before = read_tensors(choice)[0]["shares"]
+    build(six_views, copy, AVERAGED)
+    assert len(read_tensors(choice)[0]["shares"]) == len(before) - 1
 
 
 def test_a_missing_result_is_made_again(built_by_method, six_views, tmp_path):

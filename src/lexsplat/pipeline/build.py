@@ -225,8 +225,9 @@ class _Builder:
         encodes = "features" in wanted and self.encoders is None
         if encodes and not self._is_finished("features", stages["features"]):
             sizes = [view.capture_size for view in self._training_views.values()]
-            source = self.capture.root
-            self.encoders = check_encoders(self.config, source, len(sizes), max(sizes), self.listener)
+            source, cached = self.capture.root, any(self.folder.features_path.glob("*.safetensors"))
+            count = 0 if cached else len(sizes)  # with features at hand, only those missing are told, later
+            self.encoders = check_encoders(self.config, source, count, max(sizes), self.listener)
         if self.encoders is not None and self.config.features_from is not None:
             check_external_features(self.config.features_from, self.capture, self.encoders.clip.dim)
         changes = not all(self._is_finished(name, stages[name]) for name in wanted)

@@ -47,8 +47,8 @@ def views_to_read(
     gaussians = folder.read_gaussians().to(device)
     found = method.views_to_read(gaussians, whole, config, run)
     if found.shares is not None:
-        shares, names = found.shares.cpu().half(), json.dumps(list(found.views))
-        write_tensors(choice_path(folder), {"shares": shares}, {"views": names})
+        facts = {"views": json.dumps(list(found.views)), "gaussians": _gaussians_of(folder)}
+        write_tensors(choice_path(folder), {"shares": found.shares.cpu().half()}, facts)
     if len(found.views) < len(views):
         what = "features of %d of %d training photos, which show everything often enough"
         log.log(NOTE, what, len(found.views), len(views))
@@ -56,10 +56,17 @@ def views_to_read(
 
 
 def kept_choice(folder: SceneFolder, views: Mapping[str, View]) -> TrainingViews | None:
-    """The choice of an earlier run; None if its file is missing, damaged or of other views."""
+    """The choice of an earlier run; None if its file is missing, damaged, or of other views or Gaussians."""
     try:
         tensors, facts = read_tensors(choice_path(folder))
+        if facts["gaussians"] != _gaussians_of(folder):
+            return None
         names = json.loads(facts["views"])
         return TrainingViews({name: views[name] for name in names}, shares=tensors["shares"].float())
     except (FileFormatError, KeyError, ValueError):
         return None
+
+
+def _gaussians_of(folder: SceneFolder) -> str:
+    """Checksum of the Gaussians, of which other bits may want other views."""
+    return str(folder.record.get("checksums", {}).get(folder.gaussians_path.name, "unknown"))

@@ -52,7 +52,7 @@ AGREEING = 0.4
 """Agreement of the views, 1 - u_G, below which the features are doubted.
 
 Scenes of encoders that know their things have .66 to .86, and .42 after a hundred steps at a quarter of the size.
-Features of the wrong views, or mirrored ones, have .3 to .4, and noise 0 (docs/lab-notes/2026-11-encoders.md).
+Features of the wrong views, or mirrored ones, have .27 to .41, and noise 0 (docs/lab-notes/2026-11-encoders.md).
 """
 _TOLD_FROM = 12
 """Fewest views with a forecast: the calibration takes as long as about four of them."""
@@ -72,7 +72,7 @@ class AveragedConfig:
             multiples of the spread: one minus the mean cosine of a Gaussian with its nearest code. Towards 0 only the
             nearest code counts.
         min_visibility: Gaussians with less weight than this over all training views, in cells of the feature maps,
-            count as never seen.
+            count as never seen; where not all views are read, it is estimated from those that are.
         prior_visibility: Weight in cells at which a Gaussian's mean is half trusted; below it u tends to 1.
         shortest_side: Views are rendered at the size of their feature maps, but not below this many pixels on the
             short side, and reduced by at most 4.
@@ -87,9 +87,9 @@ class AveragedConfig:
         squared: Square the weights of the mean.
         agreement: Weigh each feature by exp(agreement (cos - 1)), where cos compares it with the Gaussian's mean over
             the views, in a second pass over them; in 0..30. 0 takes the mean of the first.
-        sightings: Views are read until nearly every Gaussian is shown so often by them, or as often as by all views
-            (`lexsplat.language.methods.sightings`). 0 reads all views. By default a build takes 8, and 4 with the
-            bundled encoders.
+        sightings: Views are read until every Gaussian is shown once and 95 % of so many sightings of all are there,
+            or of those that all views give (`lexsplat.language.methods.sightings`). 0 reads all views. By default a
+            build takes 8, and 4 with the bundled encoders.
         reliability: Derive u from the length of the mean. Without, u is 0 for all that the views show, and views that
             disagree are not reported.
     """

@@ -32,12 +32,12 @@ from lexsplat.runtime.workers import Needs, results
 if TYPE_CHECKING:
     from lexsplat.captures import View
 
-STAGE = "views to read"
+STAGE, SHARES_STAGE = "views to read", "sightings"
 ENOUGH_ONCE, ENOUGH = 0.999, 0.95
 """Shares of the wanted sightings at which no further view is taken: of one for every Gaussian, and of all."""
 _LONG_SIDE = 120
 _SAMPLE, _MOST_NUMBERS = 16_384, 1 << 26
-"""Gaussians that decide; fewer where there are thousands of views, whose weights take 128 MB, and twice that once."""
+"""Gaussians that decide; fewer where there are thousands of views, whose weights take 128 MB."""
 _LEAST = 0.01
 """Least weight of a Gaussian in some view, in pixels of 120 along the longer side; others are too small to tell."""
 _VIEWS_OF_A_TASK = 16
@@ -46,13 +46,14 @@ _VIEWS_OF_A_TASK = 16
 def views_that_show(
     gaussians: Gaussians, views: Mapping[str, View], sightings: int, run: FitRun
 ) -> tuple[list[str], Tensor]:
-    """Names of views that show nearly every Gaussian `sightings` times, or as often as all views do; sorted.
+    """Names of views that show the Gaussians `sightings` times, or as often as all views do; sorted.
 
     Args:
         gaussians: The geometry.
         views: Views to choose from; masked pixels show nothing.
         sightings: Wanted sightings of each Gaussian, at least 1.
-        run: Its listener receives events of stage "views to read". The result does not depend on its workers.
+        run: Its listener receives events of stage "views to read", and of stage "sightings" for the shares. The result
+            does not depend on its workers.
 
     Returns:
         The names, and the share of each Gaussian's weight over all views that these have ``[N]``: at least half of
@@ -66,20 +67,16 @@ def views_that_show(
     sample = np.unique(np.linspace(0, count - 1, taken).astype(np.int64))
     # The mip filter makes Gaussians fainter that a small image makes too large.
     shared = _Weighed(replace(gaussians.detach(), antialiased=True), views, sample)
-    weights, told, done = np.zeros((len(names), len(sample)), np.float16), FirstUnits(STAGE, "photos"), 0
+    weights, done = np.zeros((len(names), len(sample)), np.float16), 0
     possible, found = np.zeros((2, count), np.float32)
-    told(0, len(names))
-    run.listener(Event(STAGE, 0, len(names)))
-    for part, total in _weigh(shared, names, run):
+    for part, total in _weigh(shared, names, run, STAGE):
         weights[done : done + len(part)] = part
         possible += total
         done += len(part)
-        told(done, len(names))
-        run.listener(Event(STAGE, done, len(names), run.workers.metrics))
     chosen = [names[row] for row in covering(weights, sightings)]
     if not chosen:
         return everything
-    for _, total in _weigh(shared, chosen, run):
+    for _, total in _weigh(shared, chosen, run, SHARES_STAGE):
         found += total
     usual = len(chosen) / len(names)
     shares = np.where(possible > 0, found / np.maximum(possible, 1e-12), usual)
@@ -98,15 +95,22 @@ class _Weighed:
 
 
 def _weigh(
-    shared: _Weighed, names: Sequence[str], run: FitRun
+    shared: _Weighed, names: Sequence[str], run: FitRun, stage: str
 ) -> Iterator[tuple[NDArray[np.float16], NDArray[np.float32]]]:
-    """The results of `_weights_of` for all names, in order."""
+    """The results of `_weights_of` for all names, in order, with events of a stage."""
     size = _VIEWS_OF_A_TASK  # also without workers: the order of a sum decides its last bit
     tasks = {names[start]: tuple(names[start : start + size]) for start in range(0, len(names), size)}
     gaussians = shared.gaussians
     nbytes = 2 * size * len(shared.sample) + 4 * len(gaussians)
     needs = Needs(gpu=gaussians.device.type == "cuda", result=nbytes)
-    return results(run.workers.map(_weights_of, shared, tasks, needs))
+    told, done = FirstUnits(stage, "photos"), 0
+    told(0, len(names))
+    run.listener(Event(stage, 0, len(names)))
+    for part, total in results(run.workers.map(_weights_of, shared, tasks, needs)):
+        yield part, total
+        done += len(part)
+        told(done, len(names))
+        run.listener(Event(stage, done, len(names), run.workers.metrics))
 
 
 @threads_for_kernels()
