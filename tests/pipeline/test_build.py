@@ -168,7 +168,7 @@ def test_no_time_is_told_beforehand_for_photos_whose_features_may_be_there(
 ):
     copy = shutil.copytree(built_by_method / "averaged", tmp_path / "copy")
     if not cached:
-        shutil.rmtree(copy / "features")
+        shutil.rmtree(SceneFolder.open(copy).features_path)
     counts, check = [], pipeline.check_encoders
 
     def counted(config, source, photos, *arguments):

@@ -52,8 +52,8 @@ def views_that_show(
         gaussians: The geometry.
         views: Views to choose from; masked pixels show nothing.
         sightings: Wanted sightings of each Gaussian, at least 1.
-        run: Its listener receives events of stage "views to read", and of stage "sightings" for the shares. The result
-            does not depend on its workers.
+        run: Its listener receives events of stage "views to read", and for the shares of stage "sightings". The
+            result does not depend on its workers.
 
     Returns:
         The names, and the share of each Gaussian's weight over all views that these have ``[N]``: at least half of
