@@ -13,9 +13,10 @@ from lexsplat import cli
 from lexsplat.captures.sfm.triangulation import InitialPoints
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.reconstruction import Reconstructor, block_training, surroundings
+from lexsplat.reconstruction import Reconstructor, block_training, block_visits, surroundings
 from lexsplat.reconstruction.block_files import BETAS, CellState, idle, plan
-from lexsplat.reconstruction.block_training import BlockRun, VisitReconstructor, reconstruct_blocks
+from lexsplat.reconstruction.block_training import BlockRun, reconstruct_blocks
+from lexsplat.reconstruction.block_visits import VisitReconstructor
 from lexsplat.reconstruction.blocks import cut_blocks, ground_axes
 from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.reconstruction.surroundings import Surroundings, shares_in_images
@@ -76,7 +77,7 @@ def test_gaussians_that_reach_into_an_image_have_a_size_in_it(capture):
 
 
 def test_a_visit_with_all_views_takes_the_steps_of_one_piece(capture, points, monkeypatch):
-    monkeypatch.setattr(block_training, "BETAS", (0.9, 0.999))  # those of one piece
+    monkeypatch.setattr(block_visits, "BETAS", (0.9, 0.999))  # those of one piece
     whole = Reconstructor(capture, dataclasses.replace(CONFIG, warm_up=0.0, cool_down=0.0), points)
     cut = cut_blocks(capture, points.points, ground_axes(UP), 1, deal=False)
     (visit,) = (visit for group in plan(cut, CONFIG.iterations, 1) for visit in group)

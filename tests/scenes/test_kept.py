@@ -13,12 +13,13 @@ from lexsplat.queries.phrases import Thing, Understood
 from lexsplat.queries.relevancy import QueryConfig
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import ModelError
-from lexsplat.runtime.progress import NOTE
+from lexsplat.runtime.progress import NOTE, Event
 from lexsplat.scenes import kept as kept_files
 from lexsplat.scenes.answers import answer_queries, find_phrase
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.folder import BUNDLED_SCENE
 from lexsplat.scenes.kept import keep, scene_key
+from lexsplat.scenes.objects import list_document
 from lexsplat.scenes.scene import Scene, open_scene
 from lexsplat.scenes.serving import OpenScene, answer_line
 
@@ -66,6 +67,30 @@ def test_what_is_kept_is_what_is_computed_without_it(demo_copy, demo):
     assert again.seen.complete
     assert torch.equal(again.hidden, demo.hidden)
     assert again.select("mug").view_shares == demo.select("mug").view_shares
+
+
+@pytest.mark.slow
+def test_what_the_first_questions_compute_is_counted(demo_copy):
+    for name in (SEEN, OBJECTS):
+        (demo_copy / name).unlink()
+    scene, events = open_scene(demo_copy, device="cpu"), list[Event]()
+    scene.listener = events.append
+
+    def ends() -> dict[str, int]:
+        found = {event.stage: event.total for event in events if event.done == event.total}
+        assert all(event.stage in found for event in events)
+        events.clear()
+        return found
+
+    find_phrase(scene, "red apple")
+    found = ends()
+    assert found["objects"] > 10
+    assert 1 <= found["views"] <= 16, "the most promising ones of an apple and of its only instance"
+    find_phrase(scene, "red apple")
+    assert ends() == {}
+    list_document(scene)
+    assert ends() == {"views": len(scene.views) - found["views"]}
+    assert scene.seen.complete
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -19,10 +20,14 @@ from torch import Tensor
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.segments import Segments
+from lexsplat.queries.best_views import promising_views
 from lexsplat.queries.visibility import hidden_gaussians
 from lexsplat.rendering import measure_weights
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.sampling import evenly
+
+if TYPE_CHECKING:
+    from lexsplat.queries.selection import Selection
 
 MOST_VIEWS = 256
 """Best views are chosen among so many of the views."""
@@ -86,10 +91,28 @@ class Seen:
 
     def complete_all(self, listener: Listener = silent) -> None:
         """Compute what is not known yet; reports stage "views"."""
-        for place, name in enumerate(self._names):
-            listener(Event("views", place, len(self._names)))
+        self._look_into(self._names, listener)
+
+    def prepare(self, things: Sequence[Selection], listener: Listener = silent) -> None:
+        """Compute the views in which `shares` will look for some selections; reports stage "views".
+
+        All views are computed where the selections may ask for as many.
+        """
+        if self.complete:
+            return
+        names = self._names
+        if _BEST * len(things) < len(names):
+            names = list(dict.fromkeys(name for thing in things for name in promising_views(thing)))
+        self._look_into(names, listener)
+
+    def _look_into(self, names: Sequence[str], listener: Listener) -> None:
+        """Compute the columns of some views; reports stage "views"."""
+        left = [name for name in names if name in self._cameras and not self._known[self._names.index(name)]]
+        for done, name in enumerate(left):
+            listener(Event("views", done, len(left)))
             self._column(name)
-        listener(Event("views", len(self._names), len(self._names)))
+        if left:
+            listener(Event("views", len(left), len(left)))
 
     def tensors(self) -> dict[str, Tensor]:
         """All that is known, for safetensors: shares ``[S, V]`` and hidden Gaussians ``[N]``."""

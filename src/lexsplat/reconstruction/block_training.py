@@ -12,16 +12,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians, joined
 from lexsplat.reconstruction.block_files import (
-    BETAS,
     EXPOSURES,
     MOMENTS,
     STATISTICS,
@@ -32,12 +29,15 @@ from lexsplat.reconstruction.block_files import (
     idle,
     plan,
 )
+from lexsplat.reconstruction.block_visits import VisitReconstructor, adam_steps, calm_factor, visit_seed
 from lexsplat.reconstruction.blocks import Blocks, cut_blocks, ground_axes
 from lexsplat.reconstruction.densification import DensityControl
+from lexsplat.reconstruction.first_run import compile_kernels
+from lexsplat.reconstruction.forecasting import tell_time_of_blocks
 from lexsplat.reconstruction.optimizers import adam, load_optimizer_tensors
-from lexsplat.reconstruction.settings import REFERENCE_ITERATIONS, ReconstructionConfig
+from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.reconstruction.surroundings import Surroundings
-from lexsplat.reconstruction.trainer import Reconstructor, initial_gaussians
+from lexsplat.reconstruction.trainer import initial_gaussians
 from lexsplat.runtime import memory as budget
 from lexsplat.runtime.files import write_file
 from lexsplat.runtime.fingerprints import fingerprint
@@ -48,8 +48,6 @@ if TYPE_CHECKING:
     from lexsplat.captures import Capture
     from lexsplat.captures.sfm.triangulation import InitialPoints
     from lexsplat.geometry.boxes import Up
-    from lexsplat.geometry.cameras import Camera
-    from lexsplat.rendering import Rendering
 
 ROUNDS = 16
 """Least number of rounds, in each of which all blocks are visited."""
@@ -61,13 +59,6 @@ FEWEST_STEPS = 4
 """Steps of a visit at least; short trainings have fewer rounds."""
 FIXED_BYTES = 1_000
 """Bytes per Gaussian that takes part with fixed values: its values, a copy beside the trained ones, a gradient."""
-WORTH_CACHING = 3
-"""Steps for each view of a visit from which photos are kept in memory; below, most would be read only once."""
-CALM = (0.7, 0.1)
-"""From the first share of the iterations on, all learning rates fall, exponentially, to the second share of them at
-the end: the views of the last visits would otherwise count for more than the others."""
-
-_NEVER = 1 << 40
 
 
 @dataclass(frozen=True)
@@ -108,123 +99,6 @@ class _Shared:
     """Number of groups of visits before this one."""
     room: tuple[int, ...]
     """Gaussians that density control may add to each cell in this round."""
-
-
-class VisitReconstructor(Reconstructor):
-    """A part of a reconstruction: the steps of one visit, on the views of its block.
-
-    Args:
-        capture: The capture with the views of the block.
-        config: Settings of the whole.
-        visit: The visit.
-        state: The Gaussians that are trained, as they are before it.
-        around: Gaussians that take part with fixed values; None if there are none.
-        seed: Seed of the whole training.
-        photos: Folder that keeps reduced photos for the next visit (`TrainingImages`).
-        options: Device, memory and the extent of the whole capture, as in `Reconstructor`.
-    """
-
-    # The arguments of a reconstruction, and what a visit starts from.
-    def __init__(
-        self,
-        capture: Capture,
-        config: ReconstructionConfig,
-        visit: Visit,
-        state: CellState,
-        around: Surroundings | None,
-        seed: int,
-        *,
-        photos: Path | None = None,
-        **options: Any,
-    ) -> None:
-        self._visit, self._state, self._order_of_views = visit, state, visit.views(seed)
-        # Gaussians are added and removed between the visits.
-        config = replace(config, densify_every=_NEVER, densify_min_every=_NEVER, reset_opacities=False)
-        own = _seed(seed, visit.number)
-        super().__init__(capture, config, None, seed=own, **options)  # type: ignore[arg-type]
-        self._photo_folder = photos
-        if len(self._order_of_views) < WORTH_CACHING * len(set(self._order_of_views)):
-            self._photo_bytes = 0
-        self._around = None if around is None else around.to(self.device)
-        self.steps_done = visit.start
-        self.rate_factor = 1.0  # sets the learning rates of this step
-        self._load_moments()
-
-    def _initial_parameters(self, start: InitialPoints) -> dict[str, torch.nn.Parameter]:
-        return {n: torch.nn.Parameter(t.to(self.device)) for n, t in self._state.parameters.items()}
-
-    def _rates(self) -> dict[str, float]:
-        calm = calm_factor(self.config, self.steps_done)
-        return {name: calm * rate for name, rate in super()._rates().items()}
-
-    def _new_optimizers(self) -> dict[str, torch.optim.Adam]:
-        optimizers = super()._new_optimizers()
-        for optimizer in optimizers.values():
-            optimizer.param_groups[0]["betas"] = BETAS
-        return optimizers
-
-    def _load_moments(self) -> None:
-        for name in self._parameters:
-            if steps := adam_steps(self.config, name, self._visit.start):
-                moments = {m: self._state.moments[f"{m}/{name}"].to(self.device) for m in MOMENTS}
-                load_optimizer_tensors(
-                    self._optimizers[name], {"step": torch.tensor(float(steps)), **moments}
-                )
-        self._density.load_state_tensors({**self._density.state_tensors(), **self._state.statistics})
-
-    @property
-    def total_steps(self) -> int:
-        """Step at which the visit ends."""
-        return self._visit.end
-
-    def result(self) -> tuple[CellState, dict[str, Tensor]]:
-        """The trained Gaussians, and the exposures of the photos, on the CPU."""
-        tensors = {name: tensor.to("cpu") for name, tensor in self.state_dict().items()}
-        parameters = {name: tensors[f"parameters/{name}"] for name in self._parameters}
-        moments = {
-            f"{m}/{name}": tensors.get(f"optimizers/{name}/{m}", torch.zeros_like(value))
-            for m in MOMENTS
-            for name, value in parameters.items()
-        }
-        statistics = {
-            name: tensors.get(f"density/{name}", self._state.statistics[name]) for name in STATISTICS
-        }
-        exposures = {name: tensor for name, tensor in tensors.items() if name.startswith(EXPOSURES)}
-        return CellState(parameters, moments, statistics), exposures
-
-    def load_exposures(self, tensors: dict[str, Tensor]) -> None:
-        """Continue with the exposures of the last visit of this block."""
-        if self._exposures is not None and tensors:
-            self._exposures.load_state_tensors(tensors)
-
-    def _next_view(self) -> int:
-        return self._names.index(self._order_of_views[self.steps_done - self._visit.start])
-
-    def _render(self, gaussians: Gaussians, camera: Camera) -> Rendering:
-        if self._around is not None:
-            gaussians = joined([gaussians, self._around.in_image(camera)])
-        return super()._render(gaussians, camera)
-
-    def _control_density(self, means2d: Tensor, radii: Tensor, image_size: tuple[int, int]) -> None:
-        count = len(self._parameters["means"])
-        own: Any = SimpleNamespace(shape=(count, 2), grad=None)
-        if means2d.grad is not None:
-            own.grad = means2d.grad.view(-1, *means2d.shape[-2:])[..., :count, :]
-        super()._control_density(own, radii[:count], image_size)
-
-
-def calm_factor(config: ReconstructionConfig, step: int) -> float:
-    """Factor of all learning rates at a step (`CALM`)."""
-    start, last = CALM
-    return float(last ** max(0.0, (step / config.iterations - start) / (1 - start)))
-
-
-def adam_steps(config: ReconstructionConfig, name: str, step: int) -> int:
-    """Steps of the optimizer of a parameter before ``step``; those of "shN" begin with the second degree."""
-    if name != "shN":
-        return step
-    every = math.ceil(config.sh_degree_every * config.iterations / REFERENCE_ITERATIONS)
-    return max(0, step - every) if config.sh_degree else 0
 
 
 def reconstruct_blocks(
@@ -269,9 +143,15 @@ def reconstruct_blocks(
         files = CellFiles(folder.path, key, blocks, groups)
         finished, extent = files.finished(), capture.extent
         room: tuple[int, ...] = ()
+        if not workers.distributed:
+            compile_kernels(run.device, listener)
         seen = workers.see(folder)
         if finished < 0:
             finished = 0
+            if not workers.distributed:
+                tell_time_of_blocks(
+                    capture, config, points, blocks, device=run.device, memory=run.memory, listener=listener
+                )
             _write_start(files, blocks, config, points, run)
         for index, group in enumerate(groups[finished:], start=finished):
             if index == 0 or group[0].round != groups[index - 1][0].round or not room:
@@ -403,7 +283,7 @@ def _present(shared: _Shared, visit: Visit, cell: int, written: int, last: int) 
         control = DensityControl(
             replace(config, max_gaussians=len(state) + shared.room[cell]),
             shared.extent,
-            seed=_seed(shared.run.seed, visit.number, cell),
+            seed=visit_seed(shared.run.seed, visit.number, cell),
         )
         state = _refined(state, control, visit.start, visit.round_steps)
     return state
@@ -440,8 +320,3 @@ def _surroundings(
     antialiased = shared.config.antialiased
     cells = (shared.files.gaussians(latest[str(n)][0], n, antialiased) for n in visit.block.shown)
     return Surroundings.seen(cells, cameras, rng)
-
-
-def _seed(*numbers: int) -> int:
-    """A seed for a part of the training."""
-    return int(np.random.SeedSequence(numbers).generate_state(1)[0])

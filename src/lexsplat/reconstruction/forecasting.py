@@ -1,4 +1,4 @@
-"""Time estimate of a reconstruction, measured on a few steps beforehand."""
+"""Time estimate of a reconstruction, in one piece or by blocks, measured on a few steps beforehand."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from lexsplat.runtime.training import Training, time_steps
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, InitialPoints
+    from lexsplat.reconstruction.blocks import Blocks
 
 _TOLD_FROM = 1000
 """Fewest iterations with a forecast; the calibration takes as long as about a hundred of them."""
@@ -31,11 +32,44 @@ _GROWTH = {"default": 1.45, "mcmc": 1.05}
 with "default", and by definition with "mcmc"."""
 
 
+_OF_VISITS = 1.0
+"""Time of blocks in multiples of their steps."""
+
+
 def tell_time(capture: Capture, config: ReconstructionConfig, points: InitialPoints, **options: Any) -> None:
     """Log the estimated time of a reconstruction (`forecast`, whose options these are) unless it is short."""
     if config.iterations >= _TOLD_FROM:
         seconds = forecast(capture, config, points, **options)
         tell(STAGE, seconds, f"{config.iterations:,} iterations")
+
+
+def tell_time_of_blocks(
+    capture: Capture, config: ReconstructionConfig, points: InitialPoints, blocks: Blocks, **options: Any
+) -> None:
+    """Log the estimated time of a reconstruction by blocks in this process unless it is short.
+
+    The steps of one block stand for those of all, which differ by the cells that they train.
+
+    Args:
+        capture: Views and split.
+        config: Settings of the whole.
+        points: Initial points of the whole.
+        blocks: The blocks.
+        options: Device, memory and listener, as in `forecast`.
+    """
+    if config.iterations < _TOLD_FROM:
+        return
+    homes = blocks.cells_of(points.points)
+    counts = np.bincount(homes, minlength=len(blocks.cells))
+    trained = [int(counts[list(block.trained)].sum()) for block in blocks.blocks]
+    block = blocks.blocks[int(np.argsort(trained, kind="stable")[len(trained) // 2])]
+    mine = np.isin(homes, block.trained)
+    cap = config.cap(torch.device(options["device"]))
+    own = replace(config, max_gaussians=max(1, round(cap * float(mine.mean()))))
+    part = replace(capture, train_names=block.views)
+    some = replace(points, points=points.points[mine], colors=points.colors[mine])
+    seconds = _OF_VISITS * forecast(part, own, some, **options)
+    tell("blocks", seconds, f"{config.iterations:,} iterations")
 
 
 def forecast(

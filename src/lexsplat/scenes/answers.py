@@ -274,6 +274,8 @@ def find_phrase(
     """One entry of `find_phrases`."""
     understood = scene.understand(phrase)
     found = scene.find(phrase, view, threshold=threshold)
+    if scene.seen is not None and found.present != "no":
+        scene.seen.prepare([found, *found.instances], scene.listener)
     return {**found.to_dict(), "phrase": phrase, "understood": str(understood.phrase)}
 
 

@@ -16,6 +16,7 @@ from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import SMALLEST_SHARE, Selection
 from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary, gives_way
 from lexsplat.runtime.errors import FileFormatError
+from lexsplat.runtime.progress import Event
 from lexsplat.scenes.answers import rests_on
 from lexsplat.scenes.facts import NO_SEGMENTS
 from lexsplat.scenes.pixels import object_colors, shown_weights
@@ -80,6 +81,8 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
         scene: The scene.
         vocabulary: Candidate names of the objects; () takes the everyday names of `lexsplat.queries.vocabulary`.
 
+    The listener of the scene receives events of stage "objects", one for each name.
+
     Returns:
         Selections that share no Gaussian, each with its name in ``phrase`` and its likeliest names in ``names``.
 
@@ -111,7 +114,8 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     found: list[Selection] = []
     # Objects share no Gaussian, so they share scores. Surfaces come last: pieces of things leave them.
     scores, shown = torch.zeros_like(segments.masses), ~scene.hidden
-    for number in [*known[~surfaces].tolist(), *known[surfaces].tolist()]:
+    for done, number in enumerate([*known[~surfaces].tolist(), *known[surfaces].tolist()]):
+        scene.listener(Event("objects", done, len(known)))
         mask, name = named == number, words[number]
         both = scene.selection(mask | (pieces == number), scores, phrase=name)
         for each in [both] if name in STUFF else _instances(both, mask):
@@ -123,6 +127,7 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
                 found.append(
                     _named(each, words, classifier.strengths(texts, _mean_codes(scene, each)[None])[0])
                 )
+    scene.listener(Event("objects", len(known), len(known)))
     return tuple(sorted(found, key=lambda each: -float(segments.masses[each.indices].sum())))
 
 
@@ -155,6 +160,8 @@ def list_document(
         picture: File of the sheet of thumbnails; None writes none.
     """
     things = scene.objects if not vocabulary else objects_of(scene, vocabulary)
+    if scene.seen is not None:
+        scene.seen.prepare(things, scene.listener)
     if picture is not None:
         write_sheet(scene, things, picture)
     return {

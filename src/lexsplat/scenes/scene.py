@@ -97,7 +97,7 @@ class Scene:
     ) -> None:
         self.gaussians, self.field, self.views = gaussians, field, dict(views)
         self.clip, self.folder = present_name(clip), folder
-        self.listener: Listener = silent  # receives progress events of the stages "words" and "views"
+        self.listener: Listener = silent  # receives progress events, such as of stage "views"
         self._working = threading.RLock()
         """Held while something new is computed; what is known is answered without it."""
         self.query = query or QueryConfig()
