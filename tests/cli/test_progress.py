@@ -156,6 +156,34 @@ def test_work_that_cannot_be_counted_states_the_time_so_far(clock, monkeypatch, 
         assert bars._progress.tasks[0].finished
 
 
+def test_work_that_took_a_while_the_last_time_states_the_time_left(clock, monkeypatch, capsys):
+    begun = Event("export", 0, 1, {"expected": 9.0})
+    with ProgressBars() as bars:
+        bars.add(begun, 98.0)  # it began two seconds ago
+        bars(Event("export", 1, 1))
+        bars.add(begun, 88.0)  # and once more, for longer than expected
+    assert capsys.readouterr().err.splitlines() == [
+        "export: 0:02 so far, about 0:07 left",
+        "export: took 0:02",
+        "export: 0:12 so far",
+    ]
+    screen = io.StringIO()
+    monkeypatch.setattr(
+        progress, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120, _environ={})
+    )
+    with ProgressBars() as bars:
+        bars.add(begun, 98.0)
+        (task,) = bars._progress.tasks
+        left = progress._TimeLeftColumn()
+        monkeypatch.setattr(task, "_get_time", lambda: 100.0)
+        assert left.render(task).plain == "0:00:07"
+        monkeypatch.setattr(task, "_get_time", lambda: 120.0)
+        assert left.render(task).plain == "0:00:00"
+        bars(Event("export", 1, 1))
+        assert task.finished
+    assert "expected" not in screen.getvalue()
+
+
 def test_what_ray_prints_is_not_among_the_lines_of_json(capsys):
     with progress.shown_progress("json") as listener:
         listener(Event("blocks", 1, 4))

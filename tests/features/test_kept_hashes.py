@@ -9,7 +9,7 @@ import time
 import pytest
 
 from lexsplat.features import hub
-from lexsplat.runtime.environment import user_cache
+from lexsplat.runtime.user_cache import user_cache
 
 
 @pytest.fixture

@@ -1,8 +1,10 @@
 """What is said of times beforehand, and the events of work that cannot be counted."""
 
+import json
+
 import pytest
 
-from lexsplat.runtime.progress import NOTE, Event, FirstUnits, duration, tell, uncounted
+from lexsplat.runtime.progress import NOTE, Event, FirstUnits, Pace, duration, tell, uncounted
 
 
 @pytest.fixture
@@ -60,3 +62,61 @@ def test_work_that_cannot_be_counted_ends_also_if_it_fails():
     with pytest.raises(KeyError), uncounted(events.append, "export"):
         raise KeyError
     assert events == [Event("export", 0, 1), Event("export", 1, 1)]
+
+
+@pytest.fixture
+def own_cache_of_seconds(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "lexsplat" / "waits" / "seconds.json"
+
+
+def done_in(seconds, clock, of):
+    """The first event of uncounted work that takes so long."""
+    events = []
+    with uncounted(events.append, "scene", of):
+        clock[0] += seconds
+    return events[0]
+
+
+def test_work_that_cannot_be_counted_is_expected_to_take_as_long_as_the_last_time(
+    clock, own_cache_of_seconds
+):
+    assert done_in(7.0, clock, "attic") == Event("scene", 0, 1)
+    assert done_in(9.0, clock, "attic") == Event("scene", 0, 1, {"expected": 7.0})
+    assert done_in(1.0, clock, "bath") == Event("scene", 0, 1)
+    assert done_in(1.0, clock, "attic").metrics == {"expected": 9.0}
+    record = Pace().record(Event("scene", 0, 1, {"expected": 9.0}))
+    assert (record["seconds_left"], record["metrics"]) == (9.0, {})
+
+
+def test_work_that_failed_or_was_quick_says_nothing_about_the_next_time(clock, own_cache_of_seconds):
+    def fail():
+        with uncounted(lambda event: None, "scene", "attic"):
+            clock[0] += 30
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert done_in(0.9, clock, "attic") == done_in(0.1, clock, "attic") == Event("scene", 0, 1)
+    assert not own_cache_of_seconds.exists()
+
+
+@pytest.mark.parametrize("content", ["", "[1]", '{"scene attic": "x", "scene": true}', "{" * 9000, "NaN"])
+def test_a_damaged_file_of_seconds_counts_as_none(clock, own_cache_of_seconds, content):
+    own_cache_of_seconds.parent.mkdir(parents=True)
+    own_cache_of_seconds.write_text(content)
+    assert done_in(3.0, clock, "attic") == Event("scene", 0, 1)
+    assert done_in(3.0, clock, "attic").metrics == {"expected": 3.0}
+
+
+def test_seconds_that_cannot_be_kept_are_not_missed(clock, own_cache_of_seconds):
+    own_cache_of_seconds.parents[1].write_text("a file where the folder should be")
+    assert done_in(3.0, clock, "attic") == done_in(3.0, clock, "attic") == Event("scene", 0, 1)
+
+
+def test_the_oldest_of_many_seconds_give_way(clock, own_cache_of_seconds):
+    for number in range(300):
+        done_in(2.0, clock, number)
+    assert len(json.loads(own_cache_of_seconds.read_text())) == 256
+    assert done_in(2.0, clock, 299).metrics == {"expected": 2.0}
+    assert done_in(2.0, clock, 0).metrics == {}

@@ -71,7 +71,8 @@ def test_commands_write_into_their_output_and_nowhere_else(tiny_capture, tmp_pat
     assert report["status"] == [0, 0, 0, 0], done.stderr[-2000:]
     written = [Path(path) for path in report["written"]]
     assert scene / "scene.json" in written, "the hook records"
-    allowed = (scene, pictures, temporary, cache / "lexsplat" / "texts", cache / "lexsplat" / "hashes")
+    caches = (cache / "lexsplat" / name for name in ("texts", "hashes", "waits"))
+    allowed = (scene, pictures, temporary, *caches)
     strays = [
         path
         for path in written

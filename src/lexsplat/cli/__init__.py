@@ -148,16 +148,17 @@ def _run(words: list[str]) -> int:
     name = ALIASES.get(name, name)
     if name not in COMMANDS:
         _refuse(name)
-    from lexsplat.cli.waiting import starting
+    from lexsplat.cli import waiting
 
     if os.environ.get("NO_COLOR"):  # see no-color.org; rich knows it, tyro does not
         os.environ["PYTHON_TYRO_ANSI_CODES"] = "False"
     entry = COMMANDS[name]
-    with starting():
+    with waiting.starting():
         from lexsplat.cli.arguments import parse
 
         kind = getattr(importlib.import_module(f"lexsplat.cli.{entry.module}"), entry.name)
         command = parse(kind, name, rest)
+    waiting.command.set(name)
     try:
         command.run()
     except BrokenPipeError as error:

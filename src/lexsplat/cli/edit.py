@@ -165,13 +165,13 @@ class Edit:
         journal = file_of(scene.folder, "edits.jsonl")
         if self.action == "discard":
             self._discard(journal)
-        with uncounted(scene.listener, "steps"):
+        with uncounted(scene.listener, "steps", self.scene):
             editor = Editor(scene, journal)
             idle = self.action in ("undo", "redo") and not getattr(editor, self.action)()
         if idle:
             print(f"nothing to {self.action}")
         elif self.action == "save" and self.output:
-            with uncounted(scene.listener, "save"):
+            with uncounted(scene.listener, "save", self.scene):
                 saved = editor.save(self.output).root
             print(f"{saved}: written; the steps stay in {journal} until you discard them")
         elif self.action in CHANGES:
@@ -206,7 +206,7 @@ class Edit:
         chosen = chosen.grow(*grow) if grow else chosen
         chosen = chosen.shrink(*shrink) if shrink else chosen
         motion = Motion(by or (0, 0, 0), scale=self.scale, turn=self.turn)
-        with uncounted(editor.original.listener, "steps"):
+        with uncounted(editor.original.listener, "steps", f"{self.action} {self.scene}"):
             editor.change(self.action, chosen, motion, self.color or (), self.strength, self.fill)
         if chosen.present == "unsure" or chosen.note:
             why = "; ".join(filter(None, (PRESENCE[chosen.present or "yes"].lstrip("; "), chosen.note)))

@@ -78,13 +78,13 @@ class Export:
             for asked, thing in zip(found, exported(scene, self.file, found)):
                 whole = f", {len(thing):,} with the hidden ones inside it" if len(thing) > len(asked) else ""
                 print(f"{asked.phrase}: {len(asked):,} Gaussians{whole}{PRESENCE[asked.present]}")
-            with uncounted(scene.listener, "export"):
+            with uncounted(scene.listener, "export", self.file.suffix + self.scene):
                 files = export_scene(scene, self.file, found=found, language=self.language, overwrite=True)
         else:
             cameras = {name: view.camera for name, view in folder.read_cameras().items()}
             world = world_of(folder.record, cameras)
             progress = LateProgress()
-            with uncounted(progress, "export"):
+            with uncounted(progress, "export", self.file.suffix + self.scene):
                 gaussians = folder.read_gaussians()
                 files = export_gaussians(gaussians, self.file, world=world, overwrite=True, listener=progress)
         for file in files:  # an existing file was confirmed above

@@ -48,7 +48,7 @@ def open_scene(path: str, device: str, clip: str | None, shows_steps: bool = Fal
     """Open the scene of a command with its encoders; a command that shows no steps of an edit notes them."""
     note_hidden_demo(path)
     listener = LateProgress()
-    with uncounted(listener, "scene"), loading():
+    with uncounted(listener, "scene", path), loading():
         from lexsplat.scenes import scene as search
 
         scene = search.open_scene(path, device=device, clip=clip)

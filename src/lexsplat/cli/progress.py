@@ -24,7 +24,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from lexsplat.runtime.progress import Event, Listener, Pace, format_seconds
+from lexsplat.runtime.progress import EXPECTED, Event, Listener, Pace, format_seconds
 
 _SECONDS_BETWEEN_LINES = 15.0
 _ENDS = ("finished", "failed")
@@ -48,7 +48,9 @@ class _TimeLeftColumn(TimeRemainingColumn):
 
     def render(self, task: Task) -> Text:
         speed, left = _speed(task), task.remaining
-        if task.time_remaining is not None or speed is None or left is None:
+        if expected := task.fields["expected"]:  # of a stage that is not counted, from the last time
+            left, speed = max(expected - (task.elapsed or 0.0), 0.0), 1.0
+        elif task.time_remaining is not None or speed is None or left is None:
             return super().render(task)
         return Text(str(timedelta(seconds=int(left / speed))), style="progress.remaining")
 
@@ -103,7 +105,8 @@ class ProgressBars:
     def __call__(self, event: Event) -> None:
         """Show one event."""
         kept = bool(event.metrics.get("kept"))
-        numbers = " ".join(f"{name} {value:.5g}" for name, value in event.metrics.items() if name != "kept")
+        shown = {name: value for name, value in event.metrics.items() if name not in ("kept", EXPECTED)}
+        numbers = " ".join(f"{name} {value:.5g}" for name, value in shown.items())
         text = "kept from the last run" if kept else numbers
         rate = self._pace.rate(event)
         if self.console.is_terminal:
@@ -120,7 +123,7 @@ class ProgressBars:
         key, title = (event.scene, f"{event.scene}: {event.stage}") if event.scene else (event.stage,) * 2
         total = event.total if event.total > 1 or event.done else None  # None draws a pulse
         if key not in self._tasks:
-            self._tasks[key] = self._progress.add_task(title, total=total, metrics="", rate=0.0)
+            self._tasks[key] = self._progress.add_task(title, total=total, metrics="", rate=0.0, expected=0.0)
         task = next(task for task in self._progress.tasks if task.id == self._tasks[key])
         if (
             event.done < task.completed or task.description != title
@@ -130,12 +133,15 @@ class ProgressBars:
             task.start_time = self._began.pop(event.stage)
         task.total = total  # `update` keeps the old one where it gets None
         self._progress.update(task.id, completed=event.done, metrics=text, rate=rate)
+        task.fields["expected"] = 0.0 if event.done else event.metrics.get(EXPECTED, 0.0)
 
     def _print_line(self, event: Event, text: str, rate: float) -> None:
         now = time.monotonic()
         name = f"{event.scene}: {event.stage}" if event.scene else event.stage
         if event.total == 1 and not event.done:
-            line = f"{format_seconds(now - self._began.setdefault(name, now))} so far"
+            past = now - self._began.setdefault(name, now)
+            line, left = f"{format_seconds(past)} so far", event.metrics.get(EXPECTED, 0.0) - past
+            line += f", about {format_seconds(left)} left" if left > 0.5 else ""
         elif event.total == 1 and name in self._began:
             line = f"took {format_seconds(now - self._began.pop(name))}"
         else:

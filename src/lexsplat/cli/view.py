@@ -54,7 +54,7 @@ class View:
             from lexsplat.viewer.server import ViewerServer
 
         scene = open_scene(self.scene, self.device, self.clip, shows_steps=True)
-        with uncounted(scene.listener, "page"):
+        with uncounted(scene.listener, "page", self.scene):
             viewer = ViewerServer(scene, self._config())
         print(f"{self.scene} is shown at {viewer.url} (Ctrl-C stops the server)", flush=True)
         with contextlib.suppress(KeyboardInterrupt):

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -98,10 +99,14 @@ class LateProgress:
                 self._shown.clear()
 
 
+command: ContextVar[str] = ContextVar("command", default="")
+"""Name of the command that runs; each imports other modules."""
+
+
 @contextmanager
 def starting() -> Iterator[None]:
     """Import in this block what a command needs; the time so far is shown after two seconds."""
-    with uncounted(LateProgress(), "start"), loading():
+    with uncounted(LateProgress(), "start", command.get()), loading():
         yield
 
 

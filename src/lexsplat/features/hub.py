@@ -19,11 +19,11 @@ from shlex import quote
 from typing import Any
 
 from lexsplat.features.weights import INDEX, WEIGHTS, first_weights, read_config, weight_files
-from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.files import free_bytes, write_file
 from lexsplat.runtime.fingerprints import blocks, digest
 from lexsplat.runtime.progress import NOTE
+from lexsplat.runtime.user_cache import user_cache
 
 log = logging.getLogger("lexsplat")
 

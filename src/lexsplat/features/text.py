@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from lexsplat.features.hub import model_folder
-from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.errors import FileFormatError, ModelError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.user_cache import user_cache
 
 log = logging.getLogger("lexsplat")
 

@@ -9,8 +9,8 @@ from functools import lru_cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
-from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.files import write_file
+from lexsplat.runtime.user_cache import user_cache
 
 if TYPE_CHECKING:
     from simplemma import Lemmatizer

@@ -41,17 +41,6 @@ def versions() -> dict[str, str]:
     return found
 
 
-def user_cache() -> Path:
-    """The user's folder for files that can be recomputed: ``$XDG_CACHE_HOME/lexsplat``, by default
-    ``~/.cache/lexsplat``.
-
-    Raises:
-        RuntimeError: If the user has no home directory.
-    """
-    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "~/.cache"
-    return Path(home).expanduser() / "lexsplat"
-
-
 @functools.cache
 def code_identity() -> str:
     """Hash of lexsplat's source code; stored measurements are valid for one version of it."""

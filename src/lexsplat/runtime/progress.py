@@ -10,12 +10,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from lexsplat.runtime.user_cache import keep_seconds, last_seconds
+
 NOTE = 25
 """Level of log records that every user of the command line sees and that are no warnings: licenses, estimates."""
 
 logging.addLevelName(NOTE, "note")
 
 log = logging.getLogger("lexsplat")
+
+EXPECTED = "expected"
+"""Metric of the first event of a stage that is not counted: the seconds that it will take, if they are known."""
 
 SHORTEST_FORECAST = 2.0
 """Shortest stage with a forecast, in seconds."""
@@ -67,8 +72,10 @@ class Pace:
     def record(self, event: Event) -> dict[str, Any]:
         """The event as JSON data, with the rate and the seconds left; null where they are unknown."""
         rate = self.rate(event)
-        left = (event.total - event.done) / rate if rate else None
         numbers = {name: value if math.isfinite(value) else None for name, value in event.metrics.items()}
+        left = numbers.pop(EXPECTED, None)
+        if rate:
+            left = (event.total - event.done) / rate
         return {
             "scene": event.scene or None,
             "stage": event.stage,
@@ -85,11 +92,22 @@ def silent(event: Event) -> None:
 
 
 @contextmanager
-def uncounted(listener: Listener, stage: str) -> Iterator[None]:
-    """Send the events of a stage that cannot be counted: its begin, and its end after the block."""
-    listener(Event(stage, 0, 1))
+def uncounted(listener: Listener, stage: str, of: object = "") -> Iterator[None]:
+    """Send the events of a stage that cannot be counted: its begin, and its end after the block.
+
+    Args:
+        listener: Receives the events. The first has the seconds that the same work took the last time, as metric
+            `EXPECTED`.
+        stage: Name of the stage.
+        of: What the time depends on, such as the path of a scene.
+    """
+    work = f"{stage} {of}".rstrip()
+    expected = last_seconds(work)
+    listener(Event(stage, 0, 1, {} if expected is None else {EXPECTED: expected}))
+    start = time.monotonic()
     try:
         yield
+        keep_seconds(work, time.monotonic() - start)
     finally:
         listener(Event(stage, 1, 1))
 

@@ -273,7 +273,7 @@ def _attempt(
     from lexsplat.captures.sfm.mapping import map_photos
 
     if mapper == "global":  # it reports nothing
-        with uncounted(listener, "global mapper"):
+        with uncounted(listener, "global mapper", f"{len(photos.names)} photos"):
             found = map_photos(database, photos, mapper, seed, lambda: None)
         return None if found is None else replace(found, all_pairs=all_pairs)
     count, registered = len(photos.names), itertools.count(2)  # a model starts with two photos

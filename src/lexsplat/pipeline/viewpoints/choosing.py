@@ -124,7 +124,7 @@ def choose_views(
         CaptureError: If the Gaussians form no surfaces, or hardly any place shows some.
     """
 
-    with uncounted(listener, "surroundings"):
+    with uncounted(listener, "surroundings", subject):
         photo = find_photo(gaussians) if side == "auto" else None
         if photo is None:
             found = find_surroundings(gaussians, up, look_from_above(gaussians), subject, seed)

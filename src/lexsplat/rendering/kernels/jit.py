@@ -23,9 +23,9 @@ import numba
 from numba.core import event, registry
 
 from lexsplat.runtime.device import kernel_threads
-from lexsplat.runtime.environment import user_cache
 from lexsplat.runtime.fingerprints import digest
 from lexsplat.runtime.progress import NOTE
+from lexsplat.runtime.user_cache import user_cache
 
 logger = logging.getLogger("lexsplat")
 
