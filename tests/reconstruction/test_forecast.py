@@ -5,7 +5,9 @@ import pytest
 import torch
 
 from lexsplat.captures import InitialPoints, initial_points, load_capture
+from lexsplat.geometry.boxes import Up
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor, forecasting
+from lexsplat.reconstruction.blocks import cut_blocks, ground_axes
 from lexsplat.runtime.progress import NOTE
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -71,3 +73,33 @@ def test_what_is_trained_beside_a_reconstruction_counts(monkeypatch, caplog):
         with caplog.at_level(NOTE, "lexsplat"):
             forecasting.tell_time(None, config, points, memory=1 << 30, joined=Beside)
     assert caplog.messages == ["reconstruct: about 50:00 min for 1,000 iterations"]
+
+
+def test_the_forecast_of_blocks_is_that_of_the_views_and_cells_of_one(tiny_capture, monkeypatch, caplog):
+    capture = load_capture(tiny_capture)
+    points = InitialPoints(capture.points, capture.point_colors, "capture", "")
+    axes = ground_axes(Up(np.array([0.0, 0.0, 1.0]), True))
+    blocks = cut_blocks(capture, points.points, axes, 2, deal=False)
+    homes = blocks.cells_of(points.points)
+    asked = []
+
+    def timed(part, settings, some, *, counts, **options):
+        asked.append((part.train_names, settings.max_gaussians, some.points, counts, options))
+        return 10.0
+
+    monkeypatch.setattr(forecasting, "forecast", timed)
+    for iterations in (999, 1000):
+        config = ReconstructionConfig(iterations=iterations, max_gaussians=4 * len(homes))
+        with caplog.at_level(NOTE, "lexsplat"):
+            forecasting.tell_time_of_blocks(capture, config, points, blocks, 100, device="cpu", memory=1)
+    assert caplog.messages == ["blocks: about 0:12 min for 1,000 iterations"], "a fifth more than its steps"
+    ((names, cap, some, counts, options),) = asked
+    (block,) = (block for block in blocks.blocks if block.views == names)
+    mine = np.isin(homes, block.trained)
+    np.testing.assert_array_equal(some, points.points[mine])
+    assert cap == 4 * mine.sum()
+    assert options == {"device": "cpu", "memory": 1}
+    rounds = (0, 1, 4, 5, 5)  # one of density control in each hundred steps, in the first half of them
+    np.testing.assert_allclose(
+        counts[[99, 100, 499, 500, 999]], [min(cap, mine.sum() * 1.32**number) for number in rounds]
+    )

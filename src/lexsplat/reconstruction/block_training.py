@@ -149,9 +149,8 @@ def reconstruct_blocks(
         if finished < 0:
             finished = 0
             if not workers.distributed:
-                tell_time_of_blocks(
-                    capture, config, points, blocks, device=run.device, memory=run.memory, listener=listener
-                )
+                options = {"device": run.device, "memory": run.memory, "listener": listener}
+                tell_time_of_blocks(capture, config, points, blocks, config.iterations // rounds, **options)
             _write_start(files, blocks, config, points, run)
         for index, group in enumerate(groups[finished:], start=finished):
             if index == 0 or group[0].round != groups[index - 1][0].round or not room:
