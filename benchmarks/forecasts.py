@@ -1,7 +1,7 @@
 """Told and taken time of the stages of a build.
 
     python benchmarks/forecasts.py [demo] [second] [CAPTURE[=DOWNSCALE]] [--iterations N] [--method NAME] [--joint]
-        [--processor] [--json FILE]
+        [--blocks N] [--processor] [--json FILE]
 
 Builds each capture in a folder of its own and compares what the build says before a stage with what the stage took
 by the clock. "ratio" is taken / told; the goal is 0.67 to 1.5. "-" is a stage whose time nothing tells. Times of a
@@ -70,7 +70,7 @@ class PosesClock:
             self._starts[event.stage] = now
             if event.stage == "matching" and "poses" in self._starts:
                 self.taken.setdefault("SIFT features", now - self._starts["poses"])
-        elif event.stage in ("matching", "mapping") and event.done == event.total:
+        elif event.stage in ("matching", "mapping", "blocks") and event.done == event.total:
             self.taken[event.stage] = now - self._starts[event.stage]
 
 
@@ -86,6 +86,7 @@ def measure(name: str, options: argparse.Namespace) -> list[dict[str, Any]]:
         dino="bundled",
         method=options.method,
         joint=options.joint,
+        blocks=options.blocks,
     )
     clock = PosesClock()
     notes, log = Notes(), logging.getLogger("lexsplat")
@@ -113,6 +114,7 @@ def main() -> None:
     parser.add_argument("--clip", help="encoder of captures that are not bundled")
     parser.add_argument("--method", choices=tuple(METHODS), default="averaged")
     parser.add_argument("--joint", action="store_true", help="language is trained with the geometry")
+    parser.add_argument("--blocks", default="auto", help="blocks of the reconstruction")
     parser.add_argument("--processor", action="store_true", help="processor seconds in place of the clock")
     options = parser.parse_args()
     if options.processor:
@@ -129,7 +131,12 @@ def main() -> None:
                 flush=True,
             )
     write_record(
-        options.json, rows, iterations=options.iterations, method=options.method, processor=options.processor
+        options.json,
+        rows,
+        iterations=options.iterations,
+        method=options.method,
+        blocks=options.blocks,
+        processor=options.processor,
     )
     wrong = [row for row in rows if row["ratio"] and not 1 / LIMIT <= row["ratio"] <= LIMIT]
     if wrong:

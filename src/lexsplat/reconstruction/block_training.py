@@ -152,6 +152,7 @@ def reconstruct_blocks(
                 options = {"device": run.device, "memory": run.memory, "listener": listener}
                 tell_time_of_blocks(capture, config, points, blocks, config.iterations // rounds, **options)
             _write_start(files, blocks, config, points, run)
+        listener(Event("blocks", sum(map(len, groups[:finished])), total))
         for index, group in enumerate(groups[finished:], start=finished):
             if index == 0 or group[0].round != groups[index - 1][0].round or not room:
                 room = _room(files, group[0].round, index, config, cap)
