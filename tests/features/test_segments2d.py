@@ -302,6 +302,7 @@ def test_segments_share_the_stored_crops_and_are_found_once(
         segmenter, events = load_segmenter(segments), []
         found = pooled_features(maps, capture, segmenter, config, cache_dir=tmp_path, listener=events.append)
         assert [(event.stage, event.done, event.total) for event in events] == [
+            ("2D segments", 0, 2),
             ("2D segments", 1, 2),
             ("2D segments", 2, 2),
         ]

@@ -26,7 +26,7 @@ from lexsplat.features.hub import model_folder
 from lexsplat.features.settings import FeatureConfig
 from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.fingerprints import file_hash
-from lexsplat.runtime.progress import Event, Listener, silent
+from lexsplat.runtime.progress import Event, FirstUnits, Listener, silent
 
 if TYPE_CHECKING:
     from lexsplat.captures import Capture, View
@@ -251,6 +251,9 @@ def pooled_features(
     """
     paths: dict[str, Path] = {}
     apart = segmenter.kept_apart
+    missing, told = 0, FirstUnits("2D segments", "photos")
+    told(0, len(maps))
+    listener(Event("2D segments", 0, len(maps)))
     for done, name in enumerate(maps, start=1):
         view = capture.views[name]
         size = size_of_map(view.capture_size, config)
@@ -258,6 +261,9 @@ def pooled_features(
         paths[name] = Path(cache_dir) / f"{key}.segments.safetensors"
         if not is_stored(paths[name]):
             write_labels(paths[name], segmenter.labels(view, size))
+            missing += 1
+        if missing == done:  # stored ones take no time
+            told(done, len(maps))
         listener(Event("2D segments", done, len(maps)))
 
     def load(name: str) -> FeatureMap:
