@@ -8,6 +8,7 @@ from lexsplat.captures import InitialPoints, initial_points, load_capture
 from lexsplat.geometry.boxes import Up
 from lexsplat.reconstruction import ReconstructionConfig, Reconstructor, forecasting
 from lexsplat.reconstruction.blocks import cut_blocks, ground_axes
+from lexsplat.runtime.errors import TrainingError
 from lexsplat.runtime.progress import NOTE
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -73,6 +74,17 @@ def test_what_is_trained_beside_a_reconstruction_counts(monkeypatch, caplog):
         with caplog.at_level(NOTE, "lexsplat"):
             forecasting.tell_time(None, config, points, memory=1 << 30, joined=Beside)
     assert caplog.messages == ["reconstruct: about 50:00 min for 1,000 iterations"]
+
+
+def test_a_calibration_that_diverges_ends_no_build(monkeypatch, caplog):
+    def diverge(*_, **__):
+        raise TrainingError("reconstruct", expected="finite losses", found="nan")
+
+    monkeypatch.setattr(forecasting, "forecast", diverge)
+    points = InitialPoints(np.zeros((6, 3)), np.ones((6, 3)), "capture", "")
+    with caplog.at_level(NOTE, "lexsplat"):
+        forecasting.tell_time(None, ReconstructionConfig(), points, memory=1)
+    assert caplog.messages == []
 
 
 def test_the_forecast_of_blocks_is_that_of_the_views_and_cells_of_one(tiny_capture, monkeypatch, caplog):

@@ -99,9 +99,24 @@ def test_work_that_failed_or_was_quick_says_nothing_about_the_next_time(clock, o
         fail()
     assert done_in(0.9, clock, "attic") == done_in(0.1, clock, "attic") == Event("scene", 0, 1)
     assert not own_cache_of_seconds.exists()
+    done_in(30.0, clock, "attic")
+    assert done_in(0.1, clock, "attic").metrics == {"expected": 30.0}
+    assert done_in(0.1, clock, "attic").metrics == {}, "the last time it was quick"
 
 
-@pytest.mark.parametrize("content", ["", "[1]", '{"scene attic": "x", "scene": true}', "{" * 9000, "NaN"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "[1]",
+        '{"scene attic": "x", "scene": true}',
+        "{" * 9000,
+        "NaN",
+        '{"scene attic": 1e300}',
+        f'{{"scene attic": 1{"0" * 400}}}',
+        '{"scene attic": -3}',
+    ],
+)
 def test_a_damaged_file_of_seconds_counts_as_none(clock, own_cache_of_seconds, content):
     own_cache_of_seconds.parent.mkdir(parents=True)
     own_cache_of_seconds.write_text(content)

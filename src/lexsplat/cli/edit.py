@@ -20,6 +20,7 @@ from lexsplat.cli.options import (
     confirmed,
     open_scene,
     without_segments,
+    work_on,
 )
 from lexsplat.cli.values import Color, Lengths, Reach, Shift
 from lexsplat.cli.waiting import starting
@@ -165,13 +166,13 @@ class Edit:
         journal = file_of(scene.folder, "edits.jsonl")
         if self.action == "discard":
             self._discard(journal)
-        with uncounted(scene.listener, "steps", self.scene):
+        with uncounted(scene.listener, "steps", work_on(self.scene)):
             editor = Editor(scene, journal)
             idle = self.action in ("undo", "redo") and not getattr(editor, self.action)()
         if idle:
             print(f"nothing to {self.action}")
         elif self.action == "save" and self.output:
-            with uncounted(scene.listener, "save", self.scene):
+            with uncounted(scene.listener, "save", work_on(self.scene)):
                 saved = editor.save(self.output).root
             print(f"{saved}: written; the steps stay in {journal} until you discard them")
         elif self.action in CHANGES:
@@ -206,7 +207,7 @@ class Edit:
         chosen = chosen.grow(*grow) if grow else chosen
         chosen = chosen.shrink(*shrink) if shrink else chosen
         motion = Motion(by or (0, 0, 0), scale=self.scale, turn=self.turn)
-        with uncounted(editor.original.listener, "steps", f"{self.action} {self.scene}"):
+        with uncounted(editor.original.listener, "steps", work_on(self.scene, self.action)):
             editor.change(self.action, chosen, motion, self.color or (), self.strength, self.fill)
         if chosen.present == "unsure" or chosen.note:
             why = "; ".join(filter(None, (PRESENCE[chosen.present or "yes"].lstrip("; "), chosen.note)))

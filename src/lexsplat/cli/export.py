@@ -14,6 +14,7 @@ from lexsplat.cli.options import (
     confirmed,
     open_folder,
     open_scene,
+    work_on,
 )
 from lexsplat.cli.waiting import LateProgress, starting
 from lexsplat.runtime.errors import SceneFolderError
@@ -63,7 +64,7 @@ class Export:
             from lexsplat.geometry.world import world_of
             from lexsplat.scenes.exporting import ending_of, export_gaussians, export_scene, exported
 
-        ending_of(self.file)
+        work = work_on(self.scene, ending_of(self.file), *self.select)
         folder = open_folder(self.scene)
         folder.refuse_own_file(self.file)
         if not self.force:
@@ -78,13 +79,13 @@ class Export:
             for asked, thing in zip(found, exported(scene, self.file, found)):
                 whole = f", {len(thing):,} with the hidden ones inside it" if len(thing) > len(asked) else ""
                 print(f"{asked.phrase}: {len(asked):,} Gaussians{whole}{PRESENCE[asked.present]}")
-            with uncounted(scene.listener, "export", self.file.suffix + self.scene):
+            with uncounted(scene.listener, "export", work):
                 files = export_scene(scene, self.file, found=found, language=self.language, overwrite=True)
         else:
             cameras = {name: view.camera for name, view in folder.read_cameras().items()}
             world = world_of(folder.record, cameras)
             progress = LateProgress()
-            with uncounted(progress, "export", self.file.suffix + self.scene):
+            with uncounted(progress, "export", work):
                 gaussians = folder.read_gaussians()
                 files = export_gaussians(gaussians, self.file, world=world, overwrite=True, listener=progress)
         for file in files:  # an existing file was confirmed above

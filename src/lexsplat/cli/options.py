@@ -6,13 +6,14 @@ Nothing here loads torch, so that help pages and wrong usage are answered at onc
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from lexsplat.cli.waiting import LateProgress, loading, starting
+from lexsplat.cli.waiting import LateProgress, command, loading, starting
 from lexsplat.runtime.progress import uncounted
 
 if TYPE_CHECKING:
@@ -44,11 +45,16 @@ PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probabl
 """Text printed after an answer, by its value of ``present``."""
 
 
+def work_on(scene: str, *words: str) -> str:
+    """What the time of some work on a scene depends on (`lexsplat.runtime.progress.uncounted`)."""
+    return " ".join((*words, os.path.abspath(scene)))
+
+
 def open_scene(path: str, device: str, clip: str | None, shows_steps: bool = False) -> Scene:
     """Open the scene of a command with its encoders; a command that shows no steps of an edit notes them."""
     note_hidden_demo(path)
     listener = LateProgress()
-    with uncounted(listener, "scene", path), loading():
+    with uncounted(listener, "scene", work_on(path, command.get())), loading():
         from lexsplat.scenes import scene as search
 
         scene = search.open_scene(path, device=device, clip=clip)

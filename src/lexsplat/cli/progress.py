@@ -49,7 +49,9 @@ class _TimeLeftColumn(TimeRemainingColumn):
     def render(self, task: Task) -> Text:
         speed, left = _speed(task), task.remaining
         if expected := task.fields["expected"]:  # of a stage that is not counted, from the last time
-            left, speed = max(expected - (task.elapsed or 0.0), 0.0), 1.0
+            left, speed = expected - (task.elapsed or 0.0), 1.0
+            if left < 0:  # it takes longer
+                return Text("")
         elif task.time_remaining is not None or speed is None or left is None:
             return super().render(task)
         return Text(str(timedelta(seconds=int(left / speed))), style="progress.remaining")

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 from typing import TYPE_CHECKING
 
-from lexsplat.cli.options import Device, SceneArgument, open_scene
+from lexsplat.cli.options import Device, SceneArgument, open_scene, work_on
 from lexsplat.cli.waiting import starting
 from lexsplat.runtime.progress import uncounted
 
@@ -54,7 +54,7 @@ class View:
             from lexsplat.viewer.server import ViewerServer
 
         scene = open_scene(self.scene, self.device, self.clip, shows_steps=True)
-        with uncounted(scene.listener, "page", self.scene):
+        with uncounted(scene.listener, "page", work_on(self.scene)):
             viewer = ViewerServer(scene, self._config())
         print(f"{self.scene} is shown at {viewer.url} (Ctrl-C stops the server)", flush=True)
         with contextlib.suppress(KeyboardInterrupt):

@@ -45,7 +45,7 @@ def tell_codebook(
     """
     check_sample(feature_maps[names[0]], len(names), config, memory)
     with contextlib.suppress(ValueError, TrainingError):  # features that the fit refuses
-        with uncounted(listener, "calibrate"):
+        with uncounted(listener, "calibrate", f"{len(names)} views"):
             seconds = forecast(feature_maps, names, config)
         tell("codebook", seconds, f"{len(names):,} views")
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,14 +19,10 @@ from torch import Tensor
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.segments import Segments
-from lexsplat.queries.best_views import promising_views
 from lexsplat.queries.visibility import hidden_gaussians
 from lexsplat.rendering import measure_weights
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.sampling import evenly
-
-if TYPE_CHECKING:
-    from lexsplat.queries.selection import Selection
 
 MOST_VIEWS = 256
 """Best views are chosen among so many of the views."""
@@ -67,6 +62,7 @@ class Seen:
         self._working = threading.Lock()
         self._shares = np.zeros((segments.levels.shape[1], len(self._names)), np.float32)
         self._known = np.zeros(len(self._names), bool)
+        self._complete = kept is not None
         if kept is not None:
             self._shares, self._known[:] = kept["shares"].float().numpy(), True
             self.hidden = kept["hidden"].to(gaussians.device)
@@ -86,33 +82,19 @@ class Seen:
 
     @property
     def complete(self) -> bool:
-        """Whether all views are known, so that no question renders any."""
-        return bool(self._known.all())
+        """Whether all views were computed at once, so that no question renders any.
+
+        Questions that render them one by one do not make it so: the same question has the same answer afterwards.
+        """
+        return self._complete
 
     def complete_all(self, listener: Listener = silent) -> None:
         """Compute what is not known yet; reports stage "views"."""
-        self._look_into(self._names, listener)
-
-    def prepare(self, things: Sequence[Selection], listener: Listener = silent) -> None:
-        """Compute the views in which `shares` will look for some selections; reports stage "views".
-
-        All views are computed where the selections may ask for as many.
-        """
-        if self.complete:
-            return
-        names = self._names
-        if _BEST * len(things) < len(names):
-            names = list(dict.fromkeys(name for thing in things for name in promising_views(thing)))
-        self._look_into(names, listener)
-
-    def _look_into(self, names: Sequence[str], listener: Listener) -> None:
-        """Compute the columns of some views; reports stage "views"."""
-        left = [name for name in names if name in self._cameras and not self._known[self._names.index(name)]]
-        for done, name in enumerate(left):
-            listener(Event("views", done, len(left)))
+        for place, name in enumerate(self._names):
+            listener(Event("views", place, len(self._names)))
             self._column(name)
-        if left:
-            listener(Event("views", len(left), len(left)))
+        self._complete = True
+        listener(Event("views", len(self._names), len(self._names)))
 
     def tensors(self) -> dict[str, Tensor]:
         """All that is known, for safetensors: shares ``[S, V]`` and hidden Gaussians ``[N]``."""

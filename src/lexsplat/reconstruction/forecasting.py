@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from lexsplat.reconstruction.settings import ReconstructionConfig
 from lexsplat.reconstruction.trainer import STAGE, Reconstructor
+from lexsplat.runtime.errors import TrainingError
 from lexsplat.runtime.progress import Event, Listener, silent, tell
 from lexsplat.runtime.training import Training, time_steps
 
@@ -32,8 +34,8 @@ _GROWTH = {"default": 1.45, "mcmc": 1.05}
 with "default", and by definition with "mcmc"."""
 
 
-_GROWTH_OF_BLOCKS = 1.32
-"""The same for a round of visits to all blocks; 1.28 to 1.43 on the bundled captures and fox."""
+_GROWTH_OF_BLOCKS = {"default": 1.32, "mcmc": 1.05}
+"""The same for a round of visits to all blocks; 1.28 to 1.43 on the bundled captures and fox with "default"."""
 _OF_VISITS = 1.2
 """Time of blocks in multiples of that of their steps: cells are read and written, and others take part."""
 
@@ -41,8 +43,9 @@ _OF_VISITS = 1.2
 def tell_time(capture: Capture, config: ReconstructionConfig, points: InitialPoints, **options: Any) -> None:
     """Log the estimated time of a reconstruction (`forecast`, whose options these are) unless it is short."""
     if config.iterations >= _TOLD_FROM:
-        seconds = forecast(capture, config, points, **options)
-        tell(STAGE, seconds, f"{config.iterations:,} iterations")
+        with suppress(TrainingError):  # the training itself may recover
+            seconds = forecast(capture, config, points, **options)
+            tell(STAGE, seconds, f"{config.iterations:,} iterations")
 
 
 def tell_time_of_blocks(
@@ -76,13 +79,15 @@ def tell_time_of_blocks(
     own = replace(config, max_gaussians=cap)
     steps = np.arange(config.iterations)
     rounds = np.minimum(steps, config.density_schedule.stop) // round_steps
-    counts = _grown_counts(int(mine.sum()), cap, rounds, _GROWTH_OF_BLOCKS)
+    counts = _grown_counts(int(mine.sum()), cap, rounds, _GROWTH_OF_BLOCKS[config.strategy])
     part = replace(capture, train_names=block.views)
     some = replace(points, points=points.points[mine], colors=points.colors[mine])
-    seconds = _OF_VISITS * forecast(part, own, some, counts=counts, **options)
-    tell("blocks", seconds, f"{config.iterations:,} iterations")
+    with suppress(TrainingError):  # the training itself may recover
+        seconds = _OF_VISITS * forecast(part, own, some, counts=counts, **options)
+        tell("blocks", seconds, f"{config.iterations:,} iterations")
 
 
+# What a reconstruction is made of, and what takes part beside it or grows in another way.
 def forecast(
     capture: Capture,
     config: ReconstructionConfig,

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from contextlib import suppress
 from pathlib import Path
+from threading import get_ident
 
 _MOST = 256
 """Pieces of work whose seconds are kept; the oldest give way."""
 _WORTH_KEEPING = 1.0
 """Shortest time that is kept, in seconds."""
+_LONGEST = 1e7
+"""Longest time in seconds that is believed: a third of a year."""
 _MOST_BYTES = 1 << 20
 
 
@@ -33,15 +35,16 @@ def last_seconds(work: str) -> float | None:
 
 def keep_seconds(work: str, seconds: float) -> None:
     """Keep the time that this work took, unless it was short. A folder that cannot be written keeps nothing."""
-    if seconds < _WORTH_KEEPING:
-        return
     kept = _kept()
-    kept.pop(work, None)
-    kept[work] = round(seconds, 2)
+    before = kept.pop(work, None)
+    if seconds >= _WORTH_KEEPING:
+        kept[work] = round(seconds, 2)
+    elif before is None:
+        return
     with suppress(OSError, RuntimeError, ValueError):
         path = user_cache() / "waits" / "seconds.json"
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+        temporary = path.with_name(f"{path.name}.{os.getpid()}-{get_ident()}.tmp")
         temporary.write_text(json.dumps(dict(list(kept.items())[-_MOST:])), "utf-8")
         temporary.replace(path)
 
@@ -57,4 +60,4 @@ def _kept() -> dict[str, float]:
 
 
 def _is_time(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < math.inf
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < _LONGEST

@@ -274,9 +274,20 @@ def find_phrase(
     """One entry of `find_phrases`."""
     understood = scene.understand(phrase)
     found = scene.find(phrase, view, threshold=threshold)
-    if scene.seen is not None and found.present != "no":
-        scene.seen.prepare([found, *found.instances], scene.listener)
+    if found.present != "no":
+        find_best_views(scene, [found, *found.instances])
     return {**found.to_dict(), "phrase": phrase, "understood": str(understood.phrase)}
+
+
+def find_best_views(scene: Scene, things: Sequence[Selection]) -> None:
+    """Find the best view of each thing, unless its scene keeps what its views show; reports stage "views"."""
+    if scene.seen is not None and scene.seen.complete:
+        return
+    compile_drawing(scene.gaussians.device, scene.listener)
+    for done, thing in enumerate(things):
+        scene.listener(Event("views", done, len(things)))
+        thing.best_view  # noqa: B018 - it is kept
+    scene.listener(Event("views", len(things), len(things)))
 
 
 def default_views(scene: Scene) -> list[str]:

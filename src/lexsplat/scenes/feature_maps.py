@@ -18,7 +18,9 @@ from torch import Tensor
 from lexsplat.captures import stem_of
 from lexsplat.geometry.cameras import Camera
 from lexsplat.language.fields import LanguageField
+from lexsplat.rendering.first_drawing import compile_drawing
 from lexsplat.runtime.files import atomic_path, write_tensors
+from lexsplat.runtime.progress import Event
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -88,7 +90,9 @@ def write_features(scene: Scene, views: Sequence[str], folder: Path) -> dict[str
         QueryError: If a view is unknown.
     """
     written, colors = {}, code_colors(scene.field)
-    for name in views:
+    compile_drawing(scene.gaussians.device, scene.listener)
+    for done, name in enumerate(views):
+        scene.listener(Event("features", done, len(views)))
         stored, picture = (
             folder / "features" / f"{stem_of(name)}{ending}" for ending in (".safetensors", ".png")
         )
@@ -99,4 +103,5 @@ def write_features(scene: Scene, views: Sequence[str], folder: Path) -> dict[str
         with atomic_path(picture) as temporary:
             Image.fromarray(pixels).save(temporary, format="PNG")
         written[name] = {"map": str(stored), "picture": str(picture)}
+    scene.listener(Event("features", len(views), len(views)))
     return written

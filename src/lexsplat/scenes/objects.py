@@ -17,7 +17,7 @@ from lexsplat.queries.selection import SMALLEST_SHARE, Selection
 from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary, gives_way
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.progress import Event
-from lexsplat.scenes.answers import rests_on
+from lexsplat.scenes.answers import find_best_views, rests_on
 from lexsplat.scenes.facts import NO_SEGMENTS
 from lexsplat.scenes.pixels import object_colors, shown_weights
 from lexsplat.scenes.sheet import write_sheet
@@ -160,8 +160,7 @@ def list_document(
         picture: File of the sheet of thumbnails; None writes none.
     """
     things = scene.objects if not vocabulary else objects_of(scene, vocabulary)
-    if scene.seen is not None:
-        scene.seen.prepare(things, scene.listener)
+    find_best_views(scene, things)
     if picture is not None:
         write_sheet(scene, things, picture)
     return {

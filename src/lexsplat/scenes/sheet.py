@@ -14,7 +14,9 @@ from PIL import Image, ImageDraw
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.selection import Selection
 from lexsplat.rendering import render
+from lexsplat.rendering.first_drawing import compile_drawing
 from lexsplat.runtime.files import atomic_path
+from lexsplat.runtime.progress import Event
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -37,12 +39,15 @@ def write_sheet(scene: Scene, things: Sequence[Selection], path: Path) -> None:
     size = columns * width, max(1, math.ceil(len(things) / columns)) * height
     sheet = Image.new("RGB", size, (30, 30, 34))
     draw = ImageDraw.Draw(sheet)
+    compile_drawing(scene.gaussians.device, scene.listener)
     for number, thing in enumerate(things):
+        scene.listener(Event("pictures", number, len(things)))
         left, top = number % columns * width, number // columns * height
         tile = _thumbnail(scene, thing)
         sheet.paste(tile, (left + (_TILE[0] - tile.width) // 2, top + (_TILE[1] - tile.height) // 2))
         label = f"{number + 1}. {thing.phrase}".encode("latin-1", "replace").decode("latin-1")[:36]
         draw.text((left + 4, top + _TILE[1] + 3), label, fill="white")  # the built-in font has latin-1 alone
+    scene.listener(Event("pictures", len(things), len(things)))
     with atomic_path(path) as temporary:
         sheet.save(temporary, format="PNG")
 
