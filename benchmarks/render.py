@@ -2,7 +2,8 @@
 
     python benchmarks/render.py [--threads 2] [--repeats 15] [--json FILE]
 
-For each size, number of Gaussians and number of channels, in milliseconds (best and median):
+For each size, number of Gaussians and number of channels, in milliseconds (best and median by the clock, and for
+forward and backward "cpu", the median of the processor time of all threads):
 
     forward     projection, shading, sorting into tiles, blending, without gradients
     backward    gradients of all tensors from those of image and alpha
@@ -109,15 +110,16 @@ def only_places(start, stop, owners, places, lists):
         lists[places[pair]] = owners[pair]
 
 
-def measure(function, repeats: int) -> tuple[float, float]:
-    """Best and median wall time in milliseconds after one warm-up call."""
+def measure(function, repeats: int) -> tuple[float, float, float]:
+    """Best and median wall time and median processor time in milliseconds after one warm-up call."""
     function()
     times = []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = np.array([time.perf_counter(), time.process_time()])
         function()
-        times.append(1e3 * (time.perf_counter() - start))
-    return min(times), float(np.median(times))
+        times.append(1e3 * (np.array([time.perf_counter(), time.process_time()]) - start))
+    walls, processor = np.transpose(times)
+    return float(walls.min()), float(np.median(walls)), float(np.median(processor))
 
 
 def rows_of(pairs: TilePairs) -> int:
@@ -199,8 +201,9 @@ def run_case(width: int, height: int, count: int, channels: int, repeats: int) -
         raise SystemExit("the pairs are not where their tiles have them")
     return {
         "width": width, "height": height, "gaussians": count, "channels": channels, "pairs": len(pairs.members),
-        "forward_ms": forward[0], "forward_median_ms": forward[1],
+        "forward_ms": forward[0], "forward_median_ms": forward[1], "forward_processor_ms": forward[2],
         "backward_ms": backward_times[0], "backward_median_ms": backward_times[1],
+        "backward_processor_ms": backward_times[2], "blend_processor_ms": blend[2], "naive_processor_ms": naive[2],
         "blend_ms": blend[0], "naive_ms": naive[0], "ratio": naive[0] / blend[0], "floor_ms": floor[0],
         "bytes_ms": bytes_moved(gaussians, channels, pairs) / rate,
         "backward_bytes_ms": bytes_of_gradients(gaussians, channels, pairs) / rate, "places_ms": placing[0],
@@ -218,7 +221,7 @@ def main() -> None:
         f"{platform.processor() or platform.machine()}, {options.threads} threads; milliseconds: best (median)"
     )
     print(
-        f"{'size':>8} {'N':>7} {'C':>3} {'pairs':>8}   {'forward':>14}   {'backward':>14} {'Mpairs/s':>9}"
+        f"{'size':>8} {'N':>7} {'C':>3} {'pairs':>8}   {'forward':>14} {'cpu':>6}   {'backward':>14} {'cpu':>6} {'Mpairs/s':>9}"
         f" {'blend':>7} {'naive':>7} {'ratio':>6} {'exps':>6} {'bytes':>6} {'b.bytes':>7} {'places':>6}"
     )
     cases = []
@@ -230,7 +233,8 @@ def main() -> None:
                 forward = f"{c['forward_ms']:.1f} ({c['forward_median_ms']:.1f})"
                 backward = f"{c['backward_ms']:.1f} ({c['backward_median_ms']:.1f})"
                 print(
-                    f"{width:>4}x{height} {count:>7} {channels:>3} {c['pairs']:>8}   {forward:>14}   {backward:>14}"
+                    f"{width:>4}x{height} {count:>7} {channels:>3} {c['pairs']:>8}   {forward:>14} {c['forward_processor_ms']:>6.1f}"
+                    f"   {backward:>14} {c['backward_processor_ms']:>6.1f}"
                     f" {c['pairs_per_second'] / 1e6:>9.1f} {c['blend_ms']:>7.1f} {c['naive_ms']:>7.1f}"
                     f" {c['ratio']:>6.1f} {c['floor_ms']:>6.1f} {c['bytes_ms']:>6.1f} {c['backward_bytes_ms']:>7.1f}"
                     f" {c['places_ms']:>6.1f}",
