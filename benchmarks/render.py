@@ -221,8 +221,8 @@ def main() -> None:
         f"{platform.processor() or platform.machine()}, {options.threads} threads; milliseconds: best (median)"
     )
     print(
-        f"{'size':>8} {'N':>7} {'C':>3} {'pairs':>8}   {'forward':>14} {'cpu':>6}   {'backward':>14} {'cpu':>6} {'Mpairs/s':>9}"
-        f" {'blend':>7} {'naive':>7} {'ratio':>6} {'exps':>6} {'bytes':>6} {'b.bytes':>7} {'places':>6}"
+        f"{'size':>8} {'N':>7} {'C':>3} {'pairs':>8}   {'forward':>14} {'cpu':>6}   {'backward':>14} {'cpu':>6}"
+        f" {'Mpairs/s':>9} {'blend':>7} {'naive':>7} {'ratio':>6} {'exps':>6} {'bytes':>6} {'b.bytes':>7} {'places':>6}"
     )
     cases = []
     for width, height in SIZES:
@@ -233,8 +233,8 @@ def main() -> None:
                 forward = f"{c['forward_ms']:.1f} ({c['forward_median_ms']:.1f})"
                 backward = f"{c['backward_ms']:.1f} ({c['backward_median_ms']:.1f})"
                 print(
-                    f"{width:>4}x{height} {count:>7} {channels:>3} {c['pairs']:>8}   {forward:>14} {c['forward_processor_ms']:>6.1f}"
-                    f"   {backward:>14} {c['backward_processor_ms']:>6.1f}"
+                    f"{width:>4}x{height} {count:>7} {channels:>3} {c['pairs']:>8}   {forward:>14}"
+                    f" {c['forward_processor_ms']:>6.1f}   {backward:>14} {c['backward_processor_ms']:>6.1f}"
                     f" {c['pairs_per_second'] / 1e6:>9.1f} {c['blend_ms']:>7.1f} {c['naive_ms']:>7.1f}"
                     f" {c['ratio']:>6.1f} {c['floor_ms']:>6.1f} {c['bytes_ms']:>6.1f} {c['backward_bytes_ms']:>7.1f}"
                     f" {c['places_ms']:>6.1f}",
