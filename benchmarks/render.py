@@ -222,7 +222,8 @@ def main() -> None:
     )
     print(
         f"{'size':>8} {'N':>7} {'C':>3} {'pairs':>8}   {'forward':>14} {'cpu':>6}   {'backward':>14} {'cpu':>6}"
-        f" {'Mpairs/s':>9} {'blend':>7} {'naive':>7} {'ratio':>6} {'exps':>6} {'bytes':>6} {'b.bytes':>7} {'places':>6}"
+        f" {'Mpairs/s':>9} {'blend':>7} {'naive':>7} {'ratio':>6} {'exps':>6} {'bytes':>6}"
+        f" {'b.bytes':>7} {'places':>6}"
     )
     cases = []
     for width, height in SIZES:
