@@ -114,7 +114,7 @@ def main() -> None:
     parser.add_argument("--clip", help="encoder of captures that are not bundled")
     parser.add_argument("--method", choices=tuple(METHODS), default="averaged")
     parser.add_argument("--joint", action="store_true", help="language is trained with the geometry")
-    parser.add_argument("--blocks", default="auto", help="blocks of the reconstruction")
+    parser.add_argument("--blocks", default=BuildConfig.blocks, help="blocks of the reconstruction")
     parser.add_argument("--processor", action="store_true", help="processor seconds in place of the clock")
     options = parser.parse_args()
     if options.processor:
