@@ -63,7 +63,7 @@ class PosesClock:
         self._starts: dict[str, float] = {}
 
     def __call__(self, event: Event) -> None:
-        now = time.monotonic()
+        now = time.perf_counter()
         if event.stage == "triangulate" and event.done == (event.total - 3) // 2:  # all images are written
             self._starts["poses"] = now  # where the features begin, as in `poses`
         elif not event.done:
@@ -110,7 +110,7 @@ def measure(name: str, options: argparse.Namespace) -> list[dict[str, Any]]:
 def main() -> None:
     parser = argument_parser(__doc__)
     parser.add_argument("captures", nargs="*", default=["second", "demo"], metavar="CAPTURE[=DOWNSCALE]")
-    parser.add_argument("--iterations", type=int, help="steps of the reconstruction; 500 or more are told")
+    parser.add_argument("--iterations", type=int, help="steps of the reconstruction; 1,000 or more are told")
     parser.add_argument("--clip", help="encoder of captures that are not bundled")
     parser.add_argument("--method", choices=tuple(METHODS), default="averaged")
     parser.add_argument("--joint", action="store_true", help="language is trained with the geometry")

@@ -76,15 +76,17 @@ def test_what_is_trained_beside_a_reconstruction_counts(monkeypatch, caplog):
     assert caplog.messages == ["reconstruct: about 50:00 min for 1,000 iterations"]
 
 
-def test_a_calibration_that_diverges_ends_no_build(monkeypatch, caplog):
-    def diverge(*_, **__):
+def test_a_calibration_that_diverges_ends_no_build_and_leaves_no_bar(monkeypatch, caplog):
+    def diverge(*_):
         raise TrainingError("reconstruct", expected="finite losses", found="nan")
 
-    monkeypatch.setattr(forecasting, "forecast", diverge)
-    points = InitialPoints(np.zeros((6, 3)), np.ones((6, 3)), "capture", "")
+    monkeypatch.setattr(forecasting, "Reconstructor", lambda *_, **__: None)
+    monkeypatch.setattr(forecasting, "time_steps", diverge)
+    points, events = InitialPoints(np.eye(6, 3), np.ones((6, 3)), "capture", ""), []
     with caplog.at_level(NOTE, "lexsplat"):
-        forecasting.tell_time(None, ReconstructionConfig(), points, memory=1)
+        forecasting.tell_time(None, ReconstructionConfig(), points, memory=1, listener=events.append)
     assert caplog.messages == []
+    assert events[-1].done == events[-1].total > 0
 
 
 def test_the_forecast_of_blocks_is_that_of_the_views_and_cells_of_one(tiny_capture, monkeypatch, caplog):

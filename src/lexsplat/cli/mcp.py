@@ -127,7 +127,7 @@ class Mcp:
             raise LibraryError(libraries[1], expected="one library", found=str(len(libraries)))
         listener, library = LateProgress(), None
         if libraries:
-            with uncounted(listener, "library", libraries[0]):
+            with uncounted(listener, "library", Path(libraries[0]).resolve()):
                 library = open_library(libraries[0], device=self.device)
             library.listener = listener
         alone = [path for path in self.scenes if path not in libraries]

@@ -47,7 +47,7 @@ PRESENCE = {"yes": "", "unsure": "; perhaps not in this scene", "no": "; probabl
 
 def work_on(scene: str, *words: str) -> str:
     """What the time of some work on a scene depends on (`lexsplat.runtime.progress.uncounted`)."""
-    return " ".join((*words, os.path.abspath(scene)))
+    return " ".join((*words, os.path.abspath(scene) if os.path.exists(scene) else scene))
 
 
 def open_scene(path: str, device: str, clip: str | None, shows_steps: bool = False) -> Scene:

@@ -18,7 +18,7 @@ from lexsplat.pipeline.provenance import with_full_paths
 from lexsplat.pipeline.scene_progress import LastEvent, named, named_messages, relayed
 from lexsplat.runtime.errors import CaptureError
 from lexsplat.runtime.files import write_file
-from lexsplat.runtime.progress import Event, FirstUnits, Listener, silent
+from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.workers import Needs, Outcome, SharedFolder, Workers, raise_failures
 
 LIBRARIES_BYTES = 1536 << 20
@@ -52,9 +52,7 @@ def extract_on_workers(
     """
     clip, dino = encoders.clip, encoders.dino
     missing = missing_views(capture, clip, dino, config.features, cache_dir)
-    before = done = len(capture.views) - sum(map(len, missing.values()))
-    told = FirstUnits("features", "photos")
-    told(0, len(capture.views) - before)
+    done = len(capture.views) - sum(map(len, missing.values()))
     with SharedFolder.offered(cache_dir) as cache:
         views = {name: capture.views[name] for name in missing}
         shared = _Extraction(_views_only(capture), config, cache)
@@ -67,7 +65,6 @@ def extract_on_workers(
             for name, content in outcome.result.items():
                 write_file(cache.path / name, content)
             done += len(missing[outcome.name])
-            told(done - before, len(capture.views) - before)
             listener(Event("features", done, len(capture.views), workers.metrics))
     raise_failures(failed)
 

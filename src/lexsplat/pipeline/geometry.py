@@ -148,7 +148,7 @@ class _Given(Geometry):
 
     def make(self, config: BuildConfig, run: GeometryRun) -> tuple[Gaussians, dict[str, Any]]:
         splats = existing_splats(self.path)
-        with uncounted(run.fit.listener, "splats", self.path):
+        with uncounted(run.fit.listener, "splats", f"beside photos {self.path.resolve()}"):
             gaussians = splats_of_capture(splats, run.capture, run.folder)
             views = list(run.capture.train_views)
             check_agreement(gaussians, views, splats)

@@ -113,6 +113,9 @@ def forecast(
         listener: Receives an event of stage "calibrate" after each untimed step and each timed row of steps.
         joined: A training that runs the steps of a reconstruction together with those of something else.
         counts: Expected number of Gaussians at each iteration; None takes that of density control in one piece.
+
+    Raises:
+        TrainingError: If one of the steps has no finite loss.
     """
     if counts is None:
         counts = _counts(config, len(points.points), config.cap(torch.device(device)))
@@ -141,9 +144,13 @@ def forecast(
         return seconds
 
     total = 0.0
-    for warm_up, shares in parts:
-        few, most = per_step(points, warm_up), per_step(many, warm_up)
-        total += float((few + shares * (most - few)).sum())
+    try:
+        for warm_up, shares in parts:
+            few, most = per_step(points, warm_up), per_step(many, warm_up)
+            total += float((few + shares * (most - few)).sum())
+    except TrainingError:
+        listener(Event("calibrate", steps, steps))  # otherwise its bar stays
+        raise
     return total
 
 

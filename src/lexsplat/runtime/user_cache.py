@@ -17,6 +17,10 @@ _LONGEST = 1e7
 _MOST_BYTES = 1 << 20
 
 
+_done = set[str]()
+"""What this process has done."""
+
+
 def user_cache() -> Path:
     """The user's folder for files that can be recomputed: ``$XDG_CACHE_HOME/lexsplat``, by default
     ``~/.cache/lexsplat``.
@@ -34,7 +38,13 @@ def last_seconds(work: str) -> float | None:
 
 
 def keep_seconds(work: str, seconds: float) -> None:
-    """Keep the time that this work took, unless it was short. A folder that cannot be written keeps nothing."""
+    """Keep the time that this work took, unless it was short. A folder that cannot be written keeps nothing.
+
+    Of several times in one process the first counts: later ones find modules loaded.
+    """
+    if work in _done:
+        return
+    _done.add(work)
     kept = _kept()
     before = kept.pop(work, None)
     if seconds >= _WORTH_KEEPING:

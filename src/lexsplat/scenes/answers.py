@@ -281,7 +281,7 @@ def find_phrase(
 
 def find_best_views(scene: Scene, things: Sequence[Selection]) -> None:
     """Find the best view of each thing, unless its scene keeps what its views show; reports stage "views"."""
-    if scene.seen is not None and scene.seen.complete:
+    if not things or (scene.seen is not None and scene.seen.complete):
         return
     compile_drawing(scene.gaussians.device, scene.listener)
     for done, thing in enumerate(things):

@@ -7,6 +7,7 @@ from typing import Any
 
 from lexsplat.queries.selection import PRESENCES, Selection
 from lexsplat.runtime.errors import QueryError
+from lexsplat.scenes.answers import find_best_views
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.serving import shortened
 
@@ -35,6 +36,7 @@ def asked_of(scene: Scene, phrase: str) -> tuple[Selection, dict[str, Any]]:
             expected="something that the scene holds",
             found=f"not here: nothing fits {shortened(str(understood.phrase))}{note}",
         )
+    find_best_views(scene, [found])
     return found, {"understood": str(understood.phrase), "note": found.note, **certainty(found)}
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from lexsplat.geometry.world import World
 from lexsplat.queries.places import UNITS
+from lexsplat.scenes.answers import find_best_views
 from lexsplat.scenes.asked import both, joined, things_of
 from lexsplat.scenes.pairs import different, measured, view_of
 from lexsplat.scenes.scene import Scene
@@ -35,6 +36,7 @@ def measure(scene: Scene, first: str, second: str) -> dict[str, Any]:
     """
     (ones, first_asked), (ends, also) = things_of(scene, first), things_of(scene, second)
     gap, one, other = different(ones, ends, f"{first[:60]} and {second[:60]}")
+    find_best_views(scene, [one, other])
     asked = both(first_asked, also, "and", view_of(one, other))
     asked["note"] = joined(asked["note"], measured((one, ones, first_asked), (other, ends, also)))
     offset = other.center - one.center

@@ -51,7 +51,7 @@ class OpenScene:
         self._scene = self._open()
 
     def _open(self) -> Scene:
-        with uncounted(self._listener, "scene", self.path):
+        with uncounted(self._listener, "scene", f"serving {self._root.resolve()}"):
             scene = open_scene(self.path, device=self._device, clip=self._clip)
         scene.listener = self._listener
         return scene

@@ -39,7 +39,8 @@ def write_sheet(scene: Scene, things: Sequence[Selection], path: Path) -> None:
     size = columns * width, max(1, math.ceil(len(things) / columns)) * height
     sheet = Image.new("RGB", size, (30, 30, 34))
     draw = ImageDraw.Draw(sheet)
-    compile_drawing(scene.gaussians.device, scene.listener)
+    if things:
+        compile_drawing(scene.gaussians.device, scene.listener)
     for number, thing in enumerate(things):
         scene.listener(Event("pictures", number, len(things)))
         left, top = number % columns * width, number // columns * height

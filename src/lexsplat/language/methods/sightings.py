@@ -109,7 +109,8 @@ def _weigh(
     for part, total in results(run.workers.map(_weights_of, shared, tasks, needs)):
         yield part, total
         done += len(part)
-        told(done, len(names))
+        if not run.workers.distributed:  # of whose tasks many begin at once
+            told(done, len(names))
         run.listener(Event(stage, done, len(names), run.workers.metrics))
 
 

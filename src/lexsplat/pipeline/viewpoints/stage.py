@@ -77,12 +77,12 @@ def _choose(
     splats: Path, poses: Path, config: BuildConfig, device: str, listener: Listener
 ) -> dict[str, Any]:
     """Choose views and write their capture; returns facts for the record of the stage."""
-    with uncounted(listener, "splats", splats):
+    with uncounted(listener, "splats", splats.resolve()):
         gaussians = read_splats(splats).to(device)
     up = None if config.up is None else np.array(parse_vector(config.up))
     floaters = np.zeros(0, np.int64)
     if not config.keep_floaters:
-        with uncounted(listener, "floaters", splats):
+        with uncounted(listener, "floaters", splats.resolve()):
             floaters = find_floaters(gaussians, splats, up=up, seed=config.seed, listener=listener)
     gaussians = _without(gaussians, floaters)
     chosen = choose_views(
