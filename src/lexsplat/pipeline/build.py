@@ -226,7 +226,7 @@ class _Builder:
         if encodes and not self._is_finished("features", stages["features"]):
             sizes = [view.capture_size for view in self._training_views.values()]
             source, cached = self.capture.root, any(self.folder.features_path.glob("*.safetensors"))
-            count = 0 if cached else len(sizes)  # with features at hand, only those missing are told, later
+            count = 0 if cached else len(sizes)  # where some are stored, the time of the others is told later
             self.encoders = check_encoders(self.config, source, count, max(sizes), self.listener)
         if self.encoders is not None and self.config.features_from is not None:
             check_external_features(self.config.features_from, self.capture, self.encoders.clip.dim)

@@ -15,7 +15,7 @@ _WORTH_KEEPING = 1.0
 _LONGEST = 1e7
 """Longest time in seconds that is believed: a third of a year."""
 _MOST_BYTES = 1 << 20
-
+"""Largest file that is read."""
 
 _done = set[str]()
 """What this process has done."""
@@ -51,6 +51,7 @@ def keep_seconds(work: str, seconds: float) -> None:
         kept[work] = round(seconds, 2)
     elif before is None:
         return
+    # Not by `lexsplat.runtime.files`, which loads torch: the time of loading it is among what is kept.
     with suppress(OSError, RuntimeError, ValueError):
         path = user_cache() / "waits" / "seconds.json"
         path.parent.mkdir(parents=True, exist_ok=True)
