@@ -48,10 +48,10 @@ class SmoothingMLP(nn.Module):
         self.register_buffer("extent", extent.detach().clone())
         self.layers = mlp((3 + 6 * num_frequencies, *SMOOTHING_WIDTHS, SEMANTIC_CHANNELS), generator)
 
-    def forward(self, means: Tensor) -> Tensor:
-        """s_MLP ``[N, 8]`` at positions ``[N, 3]``; no gradient reaches the positions."""
+    def forward(self, means: Tensor, *, bfloat16: bool = False) -> Tensor:
+        """s_MLP ``[N, 8]`` at positions ``[N, 3]``; no gradient reaches the positions. ``bfloat16`` as in `MLP`."""
         unit = ((means.detach() - self.center) / self.extent).clamp(-2, 2)
-        return self.layers(positional_encoding(unit, self.num_frequencies))
+        return self.layers(positional_encoding(unit, self.num_frequencies), bfloat16=bfloat16)
 
 
 def positional_encoding(positions: Tensor, num_frequencies: int) -> Tensor:
@@ -83,7 +83,24 @@ class _EmptyLinear(nn.Linear):
         pass
 
 
-def mlp(widths: tuple[int, ...], generator: torch.Generator | None) -> nn.Sequential:
+class MLP(nn.Sequential):
+    """Linear layers with ReLU between them."""
+
+    def forward(self, rows: Tensor, *, bfloat16: bool = False) -> Tensor:
+        """Outputs ``[M, C]`` of inputs ``[M, D]``.
+
+        With ``bfloat16`` all layers but the first, whose inputs are positions or s, multiply bfloat16 numbers and
+        sum in float32. Weights and their gradients are float32 in any case.
+        """
+        first, *others = self
+        rows = first(rows)
+        with torch.autocast(rows.device.type, torch.bfloat16, enabled=bfloat16):
+            for layer in others:
+                rows = layer(rows)
+        return rows.float() if bfloat16 else rows
+
+
+def mlp(widths: tuple[int, ...], generator: torch.Generator | None) -> MLP:
     """Linear layers with ReLU between them, initialized as nn.Linear is, but by the given generator."""
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     layers: list[nn.Module] = []
@@ -94,4 +111,4 @@ def mlp(widths: tuple[int, ...], generator: torch.Generator | None) -> nn.Sequen
             linear.weight.uniform_(-bound, bound, generator=generator)
             linear.bias.uniform_(-bound, bound, generator=generator)
         layers += [linear, nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+    return MLP(*layers[:-1])

@@ -113,11 +113,11 @@ class TrainedField(nn.Module):
         ).features
         return rendered[..., :SEMANTIC_CHANNELS], rendered[..., SEMANTIC_CHANNELS]
 
-    def decode(self, semantics: Tensor) -> Tensor:
-        """D_MLP before its softmax (Eq. 8): ``[..., 8]`` to logits ``[..., K]``."""
+    def decode(self, semantics: Tensor, *, bfloat16: bool = False) -> Tensor:
+        """D_MLP before its softmax (Eq. 8): ``[..., 8]`` to logits ``[..., K]``. ``bfloat16`` as in `MLP`."""
         if self.normalize_rendering:
             semantics = functional.normalize(semantics, dim=-1)
-        return self.decoder(semantics)
+        return self.decoder(semantics, bfloat16=bfloat16)
 
     @torch.no_grad()
     def code_probabilities(self) -> Tensor:

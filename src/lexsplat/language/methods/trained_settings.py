@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from lexsplat.language.losses import SmoothingWeight, UncertaintyForm
 from lexsplat.runtime.defaults import where_not_given
+
+MLPPrecision = Literal["float32", "bfloat16"]
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,8 @@ class TrainedConfig:
         num_frequencies: Frequencies of the positional encoding in Eq. 13 (paper's table: 0).
         normalize_rendering: Scale the rendered s to unit length before decoding (authors' code).
         clip_decoder_grad: Largest norm of the gradient of D_MLP; None does not clip (paper).
+        mlp_precision: Numbers that both MLPs multiply in training, but for their first layers. "bfloat16" halves the
+            time of full maps on processors and GPUs that multiply it; weights, sums and losses stay in float32.
     """
 
     iterations: int = 1000
@@ -63,6 +68,7 @@ class TrainedConfig:
     num_frequencies: int = 0
     normalize_rendering: bool = False
     clip_decoder_grad: float | None = 1.0
+    mlp_precision: MLPPrecision = "float32"
 
     def __post_init__(self) -> None:
         if min(self.iterations, self.pixel_sample, self.smoothing_sample) < 0 or self.smoothing_every < 1:

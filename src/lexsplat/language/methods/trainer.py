@@ -51,6 +51,7 @@ class FieldTrainer:
     ) -> None:
         self.config = config
         self.seed = seed
+        self._bfloat16 = config.mlp_precision == "bfloat16"
         self.iteration = 0
         self.rate_factor = 1.0
         """Factor of all learning rates: halved whenever the training diverges (`lexsplat.runtime.training`)."""
@@ -125,7 +126,7 @@ class FieldTrainer:
         if config.use_uncertainty:
             rows.append(uncertainty.flatten().index_select(0, pixels))
         cross_entropy = mean_in_blocks(
-            lambda s, *rest: cross_entropy_loss(field.decode(s), *rest),
+            lambda s, *rest: cross_entropy_loss(field.decode(s, bfloat16=self._bfloat16), *rest),
             rows,
             list(field.decoder.parameters()),
         )
@@ -172,7 +173,7 @@ class FieldTrainer:
 
         def smoothing(means: Tensor, semantics: Tensor, uncertainties: Tensor) -> Tensor:
             return smoothing_loss(
-                field.smoother(means),
+                field.smoother(means, bfloat16=self._bfloat16),
                 semantics,
                 uncertainties,
                 config.min_smoothing_weight,
