@@ -7,7 +7,12 @@ import torch
 from lexsplat.language.segment_codes import SegmentCodes, segment_codes
 from lexsplat.language.segments import Segments
 from lexsplat.queries.colors import COLOR_WORDS, NEAR, cielab, color_told, color_words, may_be
-from lexsplat.queries.objects import name_probabilities, pieces_of_others, whole_segments
+from lexsplat.queries.objects import (
+    likeliest_things,
+    name_probabilities,
+    pieces_of_others,
+    whole_segments,
+)
 
 LEVELS = torch.tensor([[0, 1, 2, 3, 4], [0, 0, 1, 2, 3], [0, 0, 1, 2, 2]])
 
@@ -141,3 +146,12 @@ def test_a_segment_of_a_surface_that_a_thing_names_better_may_be_its_piece():
     assert (pieces_of_others(whole, lowest, known, table, surfaces) < 0).all(), "the table's name fits, too"
     table[1] = 0.1, 0.5
     assert (pieces_of_others(whole, lowest, known, table, surfaces) < 0).all(), "no name fits"
+
+
+def test_the_likeliest_thing_needs_half_and_is_no_surface():
+    #                              table lamp mug
+    strengths = np.array([[0.9, 0.6, 0.55], [0.9, 0.4, 0.5], [0.2, 0.49, 0.3], [0.2, 0.1, 0.1]])
+    known, surfaces = np.array([3, 5, 8]), np.array([True, False, False])
+    lowest = np.array([0, 1, 2, 3, 1])
+    assert likeliest_things(lowest, known, strengths, surfaces).tolist() == [5, 8, -1, -1, 8]
+    assert likeliest_things(lowest, known, strengths, np.ones(3, bool)).tolist() == [-1] * 5

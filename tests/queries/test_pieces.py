@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from lexsplat.geometry.gaussians import gaussians_from_points
-from lexsplat.queries.pieces import with_pieces
+from lexsplat.queries.pieces import level_with, with_pieces
 
 
 def lamp(stand_length: float, below: float, count: int = 6):
@@ -108,3 +108,18 @@ def test_nothing_lies_within_a_flat_thing():
     gaussians, labels, opacities = box_with_a_large_gaussian(0.49)
     gaussians.means[:, 2] = 0.0
     assert with_pieces(gaussians, labels, opacities).tolist() == labels.tolist()
+
+
+@pytest.mark.parametrize("normal", [0, 1, 2])
+def test_a_cluster_is_level_with_a_surface_if_it_lies_within_its_thickness_far_away_or_near(normal):
+    rng = np.random.default_rng(0)
+    top = np.c_[rng.uniform(0, 4, (500, 2)), rng.uniform(-0.05, 0.05, 500)]
+    places = [[9, 2, 0.02], [2, 2, 0.3], [2, 2, -0.3], [2, 2, 0.09]]
+    points = np.concatenate([top, *(np.array(place) + rng.normal(0, 0.01, (9, 3)) for place in places)])
+    gaussians = gaussians_from_points(
+        np.roll(points, normal + 1, axis=1), np.full((len(points), 3), 0.5), sh_degree=0, opacity=0.8
+    )
+    gaussians.log_scales.fill_(np.log(0.01))
+    labels = np.repeat(np.arange(5), [500, 9, 9, 9, 9])
+    assert level_with(gaussians, labels, 0).tolist() == [True, True, False, False, False]
+    assert level_with(gaussians, labels, 0, 1.5).tolist() == [True, True, False, False, True]

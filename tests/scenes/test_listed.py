@@ -174,3 +174,22 @@ def test_a_thing_with_a_part_is_found_as_a_whole(demo, phrase, name):
     same = found.mask & listed(demo, name).mask  # a list may leave the edges of a thing to its neighbors
     assert int(same.sum()) > 0.85 * int((found.mask | listed(demo, name).mask).sum())
     assert demo.find("mug with a beak").present != "yes"
+
+
+@pytest.mark.parametrize(
+    ("name", "height"),
+    [("bottle", 0.86 * 1.1), ("table lamp", 1.0 * 1.1)],  # tools/demo_scene: models and their scales
+)
+def test_what_stands_before_a_surface_and_shows_it_belongs_to_its_thing(demo, name, height):
+    """The neck of the bottle shows the wall, and the stand of the lamp the table."""
+    assert listed(demo, name).size[2] == pytest.approx(height, abs=0.05)
+
+
+@pytest.mark.slow
+def test_nothing_of_a_deleted_bottle_is_left_above_the_table(demo):
+    bottle, editor = demo.select("bottle"), Editor(demo)
+    editor.delete(bottle)
+    left = editor.scene.gaussians
+    places = (left.means.double().numpy() - bottle.box.center) @ bottle.box.axes.T
+    within = (abs(places) < 1.2 * bottle.box.half_sizes).all(1) & (left.means[:, 2].numpy() > 0.1)
+    assert not (within & (left.opacities.numpy() > 0.1)).any()

@@ -114,6 +114,26 @@ def pieces_of_others(
     return np.where(moved, known[things][best], -1)
 
 
+def likeliest_things(
+    lowest: IntArray, known: IntArray, strengths: FloatArray, surfaces: NDArray[np.bool_]
+) -> IntArray:
+    """The thing that describes each lowest segment at least as well as parts ask for, whatever else describes it.
+
+    Args:
+        lowest: Number in 0..V-1 of each lowest segment ``[S]``.
+        known: Words of the objects ``[K]``.
+        strengths: How well they describe each segment ``[V, K]``.
+        surfaces: Which of them are surfaces ``[K]``.
+
+    Returns:
+        A word that names no surface ``[S]``; -1 for none.
+    """
+    if surfaces.all():
+        return np.full_like(lowest, -1)
+    here = strengths[np.ix_(lowest, np.flatnonzero(~surfaces))]
+    return np.where(here.max(1) >= _PART, known[~surfaces][here.argmax(1)], -1)
+
+
 def name_probabilities(strengths: FloatArray) -> FloatArray:
     """Probabilities of words ``[W]`` from their strengths; the rest up to 1 is the probability of no word."""
     odds = np.exp(_SLOPE * (strengths - FITS))

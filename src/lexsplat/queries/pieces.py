@@ -24,6 +24,8 @@ _REACH = 1.5
 _NEAREST = 4
 _TAIL = 0.02
 """Share of the Gaussians of a surface on each side that do not tell how thick it is."""
+_BESIDE = 1.5
+"""Thicknesses of a surface within which its pieces lie: at most one above or below it."""
 _ROUNDS = 4
 """How often pieces of a surface join those that joined before."""
 
@@ -54,7 +56,9 @@ def with_pieces(
     things = shares >= _LARGEST
     things[totals.argmax()] = True
     large = shares >= _SMALLEST
-    pieces = ~things & (large | _level(gaussians, labels, int(totals.argmax()))) if surface else ~things
+    pieces = ~things
+    if surface:
+        pieces &= large | level_with(gaussians, labels, int(totals.argmax()), _BESIDE)
     joined = np.arange(len(shares))
     for _ in range(_ROUNDS if surface else 1):
         members = np.flatnonzero(pieces[labels])
@@ -74,8 +78,17 @@ def with_pieces(
     return np.unique(joined[labels], return_inverse=True)[1].astype(np.intp)
 
 
-def _level(gaussians: Gaussians, labels: IntArray, largest: int) -> NDArray[np.bool_]:
-    """Which clusters lie in the plane of the largest one, on average at most one thickness above or below it."""
+def level_with(
+    gaussians: Gaussians, labels: IntArray, largest: int, thicknesses: float = 0.5
+) -> NDArray[np.bool_]:
+    """Which clusters ``[C]`` lie in the plane of the largest one.
+
+    Args:
+        gaussians: The M Gaussians.
+        labels: The cluster of each ``[M]``, numbered from 0.
+        largest: The number of that cluster.
+        thicknesses: How far from its middle their mean may be, in its thickness: 0.5 is within it.
+    """
     means = gaussians.means.detach().cpu().double().numpy()
     members = np.flatnonzero(labels == largest)
     own = means[members]
@@ -84,7 +97,7 @@ def _level(gaussians: Gaussians, labels: IntArray, largest: int) -> NDArray[np.b
     spreads = _deviations(gaussians, members, np.broadcast_to(normal, own.shape))
     thick = max(high - low, float(np.median(spreads)))
     heights = np.bincount(labels, means @ normal) / np.bincount(labels)
-    return np.asarray(np.abs(heights - (low + high) / 2) <= 1.5 * thick)
+    return np.asarray(np.abs(heights - (low + high) / 2) <= thicknesses * thick)
 
 
 def _within(gaussians: Gaussians, labels: IntArray, specks: IntArray, others: IntArray) -> NDArray[np.bool_]:

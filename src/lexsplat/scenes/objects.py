@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from lexsplat.queries.objects import name_probabilities, pieces_of_others, whole_segments
+from lexsplat.queries.objects import (
+    likeliest_things,
+    name_probabilities,
+    pieces_of_others,
+    whole_segments,
+)
+from lexsplat.queries.pieces import level_with
 from lexsplat.queries.presence import FAINT
 from lexsplat.queries.relations import same
 from lexsplat.queries.relevancy import check_prompts
@@ -31,6 +37,8 @@ _MAX_BYTES = 1 << 20
 _MAX_LENGTH = 120
 _NAMES = 3
 _LEAST_PROBABILITY = 0.01
+_MOST = 0.5
+"""Share of a piece that lies apart from its surface, by opacity, which one thing's name must describe."""
 _FAR_BETTER = 0.5
 """Share of the likeliest name's probability below which an object's own name gives way to it."""
 
@@ -108,9 +116,12 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     surfaces = np.array([words[number] in SURFACES for number in known], bool)
     strengths = classifier.strengths(texts[known], codes.distributions)
     others = pieces_of_others(whole, codes.numbers[0], known, strengths, surfaces)
-    named, pieces = (
-        torch.from_numpy(each).to(segments.labels)[segments.labels] for each in (numbers, others)
+    likeliest = likeliest_things(codes.numbers[0], known, strengths, surfaces)
+    named, pieces, things = (
+        torch.from_numpy(each).to(segments.labels)[segments.labels] for each in (numbers, others, likeliest)
     )
+    for number in known[surfaces].tolist():
+        pieces = _with_pieces_apart(scene, named == number, pieces, things)
     found: list[Selection] = []
     # Objects share no Gaussian, so they share scores. Surfaces come last: pieces of things leave them.
     scores, shown = torch.zeros_like(segments.masses), ~scene.hidden
@@ -129,6 +140,35 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
                 )
     scene.listener(Event("objects", len(known), len(known)))
     return tuple(sorted(found, key=lambda each: -float(segments.masses[each.indices].sum())))
+
+
+def _with_pieces_apart(
+    scene: Scene, surface: torch.Tensor, pieces: torch.Tensor, things: torch.Tensor
+) -> torch.Tensor:
+    """The pieces of things ``[N]`` with what lies apart from a surface, off its plane, and is most like one thing.
+
+    The neck of a green bottle shows the wall behind it, so that "wall" describes it best. It stands before the wall.
+
+    Args:
+        scene: The scene.
+        surface: The Gaussians of the surface ``[N]`` bool.
+        pieces: The word of the thing that each Gaussian is a piece of ``[N]``, -1 for none.
+        things: The word of the thing that each Gaussian is like ``[N]``, -1 for none.
+    """
+    if not bool((surface & (things >= 0)).any()):
+        return pieces
+    chosen = scene.selection(surface, torch.zeros_like(scene.field.segments.masses))
+    labels, weights = chosen._clusters()
+    like = things[chosen.indices].cpu().numpy()
+    opacities = scene.gaussians.opacities[chosen.indices].detach().cpu().double().numpy()
+    found = pieces.clone()
+    apart = ~level_with(chosen.selected, labels, int(weights.argmax()))
+    for label in np.flatnonzero(apart & (weights < SMALLEST_SHARE * weights.max())):
+        own = labels == label
+        shares = np.bincount(like[own] + 1, opacities[own])
+        if shares.argmax() > 0 and shares.max() > _MOST * shares.sum():
+            found[chosen.indices[torch.from_numpy(own).to(chosen.indices.device)]] = int(shares.argmax()) - 1
+    return found
 
 
 def _instances(both: Selection, mask: torch.Tensor) -> list[Selection]:
