@@ -376,7 +376,7 @@ def test_under_a_deleted_cloth_lies_the_table_and_what_stood_on_it_stays(demo):
     assert editor.scene.find("tablecloth").present == "no"
     assert editor.scene.find("mug").count == 2, "the fill is no mug between them"
     for name in ("apple", "rubber duck", "traffic cone", "ring", "banana"):
-        assert len(editor.scene.find(name)) == pytest.approx(len(demo.find(name)), rel=0.02), name
+        assert len(editor.scene.find(name)) == pytest.approx(len(demo.find(name)), rel=0.05), name
     added = editor.scene.field.segments.added
     heights = editor.scene.gaussians.means[added][:, 2]
     assert float(heights.min()) > -0.1

@@ -55,6 +55,8 @@ def words(text: str) -> list[str]:
 
 DIVIDED = frozenset(words(_DIVIDED))
 """Names of surfaces that the things on them, or before them, divide into pieces."""
+CARRIERS = DIVIDED - {"wall", "ceiling"}
+"""Names of surfaces that things stand on."""
 SURFACES = DIVIDED | frozenset(words(_OTHER_SURFACES))
 """Names of surfaces, materials and parts: none of them is a "thing" when everything is asked for."""
 MATERIALS = frozenset(words(_MATERIALS))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from lexsplat.queries.objects import (
     likeliest_things,
@@ -20,13 +21,14 @@ from lexsplat.queries.presence import FAINT
 from lexsplat.queries.relations import same
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import SMALLEST_SHARE, Selection
-from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary, gives_way
+from lexsplat.queries.vocabulary import CARRIERS, STUFF, SURFACES, default_vocabulary, gives_way
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.progress import Event
 from lexsplat.scenes.answers import find_best_views, rests_on
 from lexsplat.scenes.facts import NO_SEGMENTS
 from lexsplat.scenes.pixels import object_colors, shown_weights
 from lexsplat.scenes.sheet import write_sheet
+from lexsplat.scenes.underfoot import underfoot
 
 if TYPE_CHECKING:
     from lexsplat.scenes.scene import Scene
@@ -37,6 +39,8 @@ _MAX_BYTES = 1 << 20
 _MAX_LENGTH = 120
 _NAMES = 3
 _LEAST_PROBABILITY = 0.01
+_SEEN = 1.0
+"""Pixels of all views from which a Gaussian of a surface tells its height and color."""
 _MOST = 0.5
 """Share of a piece that lies apart from its surface, by opacity, which one thing's name must describe."""
 _FAR_BETTER = 0.5
@@ -123,6 +127,7 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     for number in known[surfaces].tolist():
         pieces = _with_pieces_apart(scene, named == number, pieces, things)
     found: list[Selection] = []
+    carriers = [number for number in known.tolist() if words[number] in CARRIERS]
     # Objects share no Gaussian, so they share scores. Surfaces come last: pieces of things leave them.
     scores, shown = torch.zeros_like(segments.masses), ~scene.hidden
     for done, number in enumerate([*known[~surfaces].tolist(), *known[surfaces].tolist()]):
@@ -131,6 +136,8 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
         both = scene.selection(mask | (pieces == number), scores, phrase=name)
         for each in [both] if name in STUFF else _instances(both, mask):
             named[each.indices] = number
+            if name not in SURFACES:
+                each = _without_surface(scene, each, named, carriers)
             each = each.within(shown)
             if (
                 each and float(scene.gaussians.opacities[each.indices].mean()) >= FAINT
@@ -157,7 +164,7 @@ def _with_pieces_apart(
     """
     if not bool((surface & (things >= 0)).any()):
         return pieces
-    chosen = scene.selection(surface, torch.zeros_like(scene.field.segments.masses))
+    chosen = scene.selection(surface, torch.zeros(len(surface), device=surface.device))
     labels, weights = chosen._clusters()
     like = things[chosen.indices].cpu().numpy()
     opacities = scene.gaussians.opacities[chosen.indices].detach().cpu().double().numpy()
@@ -169,6 +176,31 @@ def _with_pieces_apart(
         if shares.argmax() > 0 and shares.max() > _MOST * shares.sum():
             found[chosen.indices[torch.from_numpy(own).to(chosen.indices.device)]] = int(shares.argmax()) - 1
     return found
+
+
+def _without_surface(scene: Scene, thing: Selection, named: torch.Tensor, carriers: list[int]) -> Selection:
+    """The thing without its segments that are the surface it stands on; they are named as that surface.
+
+    Args:
+        scene: The scene.
+        thing: The thing.
+        named: The word of each Gaussian ``[N]``; changed.
+        carriers: Words of the surfaces that carry things.
+    """
+    segments = scene.field.segments
+    if segments is None:
+        return thing
+    surfaces = torch.isin(named, torch.tensor(carriers, device=named.device))
+    surfaces &= ~scene.hidden & (segments.masses >= _SEEN)
+    back = underfoot(thing, surfaces, segments.labels)
+    if not len(back):
+        return thing
+    means, places = thing.gaussians.means.detach(), surfaces.nonzero()[:, 0]
+    _, nearest = cKDTree(means[places].cpu().numpy()).query(means[back].cpu().numpy())
+    named[back] = named[places[torch.from_numpy(nearest).to(places.device)]]
+    kept = thing.mask.clone()
+    kept[back] = False
+    return thing.within(kept)
 
 
 def _instances(both: Selection, mask: torch.Tensor) -> list[Selection]:

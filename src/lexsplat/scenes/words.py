@@ -25,7 +25,15 @@ from lexsplat.queries.relevancy import gaussian_relevancy
 from lexsplat.queries.scoring import form_used, scores_in_form
 from lexsplat.queries.selection import Presence, Selection, union
 from lexsplat.queries.thresholds import BORDER
-from lexsplat.queries.vocabulary import STUFF, SURFACES, is_part, is_part_alone, part_named, thing_of_part
+from lexsplat.queries.vocabulary import (
+    CARRIERS,
+    STUFF,
+    SURFACES,
+    is_part,
+    is_part_alone,
+    part_named,
+    thing_of_part,
+)
 from lexsplat.runtime.device import threads_for_kernels
 from lexsplat.runtime.fingerprints import digest
 from lexsplat.scenes.gone import gone_nouns, noun_of
@@ -40,6 +48,8 @@ MEMBER = 0.9
 """Score of an object that is the answer, where language has less: at the border itself, masks stay empty."""
 _PIECE = 0.3
 """Share of an object of its name from which a word is that object."""
+_MOSTLY = 0.7
+"""Share of an object of its noun from which a phrase with a color or another quality is that object."""
 _PER_THREAD = 100_000
 """Gaussians for each thread of torch: with fewer, waiting for each other costs more than it saves."""
 KEPT_GRAPHS, _KEPT_GRAPH = 16, 20_000
@@ -137,8 +147,8 @@ def completed(scene: Scene, prompt: str, word: Word) -> Word:
     if scene.query.fixed or is_part(prompt) or is_part_alone(prompt):
         return word
     taken, named = (word.scores >= BORDER) & ~scene.hidden, listed_under(scene, noun_of(prompt))
-    if is_qualified(prompt):  # a yellow book is not the stack
-        named = [each for each in named if each.phrase == prompt.lower()]
+    if is_qualified(prompt):  # a yellow book is not the stack, but a gold ring is the ring
+        named = [each for each in named if each.phrase == prompt.lower() or _is_mostly(each, taken)]
     found = [
         each
         for each in named
@@ -153,9 +163,15 @@ def completed(scene: Scene, prompt: str, word: Word) -> Word:
     return replace(word, scores=scores)
 
 
+def _is_mostly(thing: Selection, taken: Tensor) -> bool:
+    """Whether a word takes nearly all of a thing."""
+    return int(taken[thing.indices].sum()) >= _MOSTLY * len(thing)
+
+
 def _is_scrap(other: Selection, taken: Tensor) -> bool:
     """Whether a word takes a little of another thing, such as the upper edge of the books before a lamp."""
-    return other.phrase not in SURFACES and 0 < int(taken[other.indices].sum()) < _PIECE * len(other)
+    known = other.phrase not in SURFACES or other.phrase in CARRIERS
+    return known and 0 < int(taken[other.indices].sum()) < _PIECE * len(other)
 
 
 def of_part(scene: Scene, prompt: str, word: Word) -> Word:

@@ -1,0 +1,101 @@
+"""Segments of a thing that are the surface that it stands on.
+
+The table within a ring, and a strip of cloth beside it, look like the ring to the encoder, whose crops show both.
+They lie as deep as the table around, and have its colors. They go back to it: a recolored ring leaves its wood alone.
+
+Dimension letters: N Gaussians of the scene, M of the thing, S of the surface near it, K neighbors.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from lexsplat.queries.colors import cielab
+from lexsplat.queries.selection import FAINT, Selection
+from lexsplat.scenes.formats.tables import colors_of
+
+_NEIGHBORS = 64
+_RANK = 5
+"""Of the neighbors' colors, the one of this rank counts, from 0: a few strays are of any color."""
+_FEWEST = 16
+"""Gaussians that rise from the surface, at least: what lies flat altogether is a sheet on it."""
+_REACH = 2.5
+"""Radii of a thing around its center in which the surface is looked at."""
+_LEVEL = 0.9
+"""Share of the surface's own Gaussians that are no farther from the height around them than is level."""
+_UNLIKE = 25.0
+"""Difference of colors in CIELAB above which a segment is not of the surface, even if the thing is no nearer."""
+_MOST = 0.6
+"""Share of a segment, by opacity, that must be level and of the surface's colors.
+
+All are chosen on the second bundled scene, where a pale saucer on wood stays with its candle."""
+
+FloatArray = NDArray[np.float64]
+
+
+def underfoot(thing: Selection, surfaces: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+    """The Gaussians of a thing whose segments are the surface around it.
+
+    Args:
+        thing: The thing.
+        surfaces: Which Gaussians are visible ones of surfaces that carry things ``[N]`` bool.
+        labels: The lowest segment of each Gaussian ``[N]``.
+
+    Returns:
+        Their indices ``[B]``.
+    """
+    nothing = thing.indices[:0]
+    if len(thing) <= _FEWEST:
+        return nothing
+    across, heights = _upright(thing.points[0], thing.up.direction)
+    middle, radius = across.mean(0), float(np.ptp(across, axis=0).max()) / 2
+    near = surfaces & (thing.gaussians.opacities.detach() >= FAINT)
+    places = near.nonzero()[:, 0]
+    means = thing.gaussians.means.detach()[places].cpu().double().numpy()
+    level, floor = _upright(means, thing.up.direction)
+    close = (np.abs(level - middle).max(1) < _REACH * radius) & (
+        np.abs(floor - np.quantile(heights, 0.02)) < radius
+    )
+    places, level, floor = places[torch.from_numpy(close).to(places.device)], level[close], floor[close]
+    if len(places) < _NEIGHBORS:
+        return nothing
+    around = cKDTree(level)
+    beside = around.query(across, k=_NEIGHBORS)[1]
+    raised = heights - np.median(floor[beside], 1)
+    rough = np.abs(floor - np.median(floor[around.query(level, k=_NEIGHBORS)[1]], 1))
+    thick = float(np.quantile(rough, _LEVEL))
+    body = np.flatnonzero(raised > 2 * thick)
+    if len(body) < _FEWEST:
+        return nothing
+    own, theirs = (_cielab(thing, index) for index in (thing.indices, places))
+    points = thing.points[0]
+    nearest = body[cKDTree(points[body]).query(points, k=min(_NEIGHBORS, len(body)))[1]]
+    unlike_surface, unlike_thing = _difference(own, theirs[beside]), _difference(own, own[nearest])
+    alike = unlike_surface < np.minimum(unlike_thing, _UNLIKE)
+    level_too = np.abs(raised) <= thick
+    segments, weights = labels[thing.indices].cpu().numpy(), thing.points[1]
+    totals = np.bincount(segments, weights)
+    found = (np.bincount(segments, weights * level_too) >= _MOST * totals) & (
+        np.bincount(segments, weights * alike) >= _MOST * totals
+    )
+    return thing.indices[torch.from_numpy(found[segments]).to(thing.indices.device)]
+
+
+def _upright(points: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points ``[M, 3]`` from above ``[M, 2]``, and their heights ``[M]``."""
+    across = np.linalg.svd(np.eye(3) - np.outer(up, up))[0][:, :2]
+    return points @ across, points @ up
+
+
+def _cielab(thing: Selection, index: torch.Tensor) -> FloatArray:
+    return cielab(colors_of(thing.gaussians.select(index)).astype(np.float64) / 255)
+
+
+def _difference(colors: FloatArray, others: FloatArray) -> FloatArray:
+    """The difference of each color ``[M, 3]`` from the one of rank `_RANK` among others ``[M, K, 3]``."""
+    apart = np.linalg.norm(others - colors[:, None], axis=2)
+    rank = min(_RANK, apart.shape[1] - 1)
+    return np.asarray(np.partition(apart, rank, axis=1)[:, rank])
