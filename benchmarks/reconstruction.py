@@ -42,6 +42,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no-renewal": {"renewal": 0.0},
     "classic": {"antialiased": False},
     "half-cap": {"max_gaussians": 20_000},
+    "quarter-cap": {"max_gaussians": 10_000},
     "regularized": {"opacity_weight": 0.01, "scale_weight": 0.01},
     "degree-1": {"sh_degree": 1},
     "exposure": {"exposure": True},

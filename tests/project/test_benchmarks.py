@@ -33,6 +33,25 @@ def test_every_benchmark_has_help(script, monkeypatch, capsys):
     assert "usage:" in capsys.readouterr().out
 
 
+def test_the_benchmark_of_reconstruction_trains_few_photos_from_as_many_points_as_asked(
+    monkeypatch, tmp_path, capsys
+):
+    monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))
+    import reconstruction
+
+    path = tmp_path / "rows.json"
+    arguments = ["second=2", "--iterations", "2", "--variants", "default", "quarter-cap"]
+    monkeypatch.setattr(
+        sys, "argv", ["reconstruction.py", *arguments, "--points", "0", "3000", "--json", str(path)]
+    )
+    reconstruction.main()
+    rows = json.loads(path.read_text())["rows"]
+    assert [row["variant"] for row in rows] == ["default"] * 2 + ["quarter-cap"] * 2
+    few, many = (row["points"] for row in rows[:2])
+    assert few < many < 3010
+    assert "PSNR" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_the_gpu_benchmark_runs_on_a_cpu_and_records_its_conditions(monkeypatch, tmp_path, capsys):
     monkeypatch.syspath_prepend(str(BENCHMARKS[0].parent))

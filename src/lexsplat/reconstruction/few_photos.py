@@ -40,7 +40,9 @@ def has_few_photos(capture: Capture) -> bool:
     return len(capture.train_views) <= FEW_PHOTOS
 
 
-def points_between(capture: Capture, known: InitialPoints, seed: int = 0) -> InitialPoints:
+def points_between(
+    capture: Capture, known: InitialPoints, seed: int = 0, *, enough: int = ENOUGH_POINTS
+) -> InitialPoints:
     """The known points, and points at random pixels of the training views.
 
     A pixel has the depth of the known point that projects nearest to it, and the color of the photo.
@@ -49,13 +51,14 @@ def points_between(capture: Capture, known: InitialPoints, seed: int = 0) -> Ini
         capture: The capture, at the size of the training.
         known: Points of structure from motion.
         seed: Seed of the pixels.
+        enough: Number of points up to which some are added, where there are pixels enough.
 
     Raises:
         CaptureError: If a photo cannot be read.
     """
     views, rng = capture.train_views, np.random.default_rng(seed)
     pixels = sum(view.camera.width * view.camera.height for view in views)
-    lacking = max(0, min(ENOUGH_POINTS, pixels // PIXELS_A_POINT) - len(known.points))
+    lacking = max(0, min(enough, pixels // PIXELS_A_POINT) - len(known.points))
     share = lacking / max(pixels, 1)
     found = [_points_of(view, known.points, share, rng) for view in views]
     points, colors = (
