@@ -1,13 +1,20 @@
 """Relevancy relative to everyday words: what holds for one encoder holds for others."""
 
+import json
+from importlib.resources import files
+
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import distance_transform_edt
+from selection import NEVER
 from web_like import Facts, _deepest, general_phrases, make_web_like, measure
 
+from lexsplat import cli
+from lexsplat.evaluation.demo import demo_capture
 from lexsplat.queries.everyday import BORDER, STEEPNESS, EverydayScale, _quantile, everyday_words
 from lexsplat.queries.relevancy import QueryConfig, Question, code_relevancy
+from lexsplat.scenes.scene import open_scene
 
 unit = torch.nn.functional.normalize
 
@@ -132,6 +139,24 @@ def test_a_web_like_encoder_has_the_cosines_of_clip_for_phrases_and_photos_of_th
     assert found["canonical"] == pytest.approx(facts.canonical, abs=0.02)
     assert found["offset"] == pytest.approx(facts.offset * facts.signal, abs=0.005)
     assert found["spread of gains"] < 0.1
+
+
+@pytest.mark.slow
+def test_a_web_like_encoder_answers_about_the_demo_with_nothing_fitted_to_it(web_like, tmp_path, capsys):
+    """The second scene chose the rules, with the bundled encoder and with others of this family."""
+    capture, folder = demo_capture("tabletop"), tmp_path / "scene"
+    build = ["language", str(capture), "--splats", str(files("lexsplat") / "demo/scene/gaussians.ply")]
+    assert cli.main([*build, "--clip", str(web_like), "--dino", "none", "--output", str(folder)]) == 0
+    capsys.readouterr()
+    assert cli.main(["evaluate", str(folder), "--protocols", "strict", "--json"]) == 0
+    measured = json.loads(capsys.readouterr().out)["language"]["strict"]
+    assert measured["auto"]["mIoU"] > 0.83
+    assert measured["oracle"]["mIoU"] - measured["auto"]["mIoU"] < 0.06
+    scene = open_scene(folder, device="cpu")
+    present = scene.ask(list(json.loads((capture / "prompts.json").read_text()))).presences
+    absent = scene.ask(["wooden crate", "candle", "striped ball", *NEVER]).presences
+    assert sum(each == "yes" for each in present) >= 0.9 * len(present)
+    assert sum(each == "yes" for each in absent) <= 0.1 * len(absent)
 
 
 def test_no_phrase_of_the_check_has_a_part_in_the_fit():
