@@ -12,8 +12,8 @@ missing pixel is copied from where one of them leads, which is chosen in rounds 
 Shifts are found in the image divided by its local brightness, in which shadows weigh less. `light` is what the image
 lacks beside the hole in the shadow of the thing that stood there.
 
-The median of step 1 is also made for the rim, where the image is known. Its error there decides how far the prediction
-in the hole is trusted.
+The median of step 1 is also made for the rim, where the image is known. Its error there decides how far the
+prediction in the hole is trusted.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ the rim knows to what neighbors must agree on."""
 _BRIGHT = 0.7
 """Share of the pixels to which the shifts lead that are darker than the surface without a shadow. Others lie in
 shadows, too, so the median is too dark."""
-_SHADOW, _FADE, _SOFTNESS, _MOST = 1.5, 0.5, 0.2, 2.0
+_SHADOW, _FADE, _SOFTNESS, _MOST = 1.5, 0.5, 0.1, 2.0
 """How far a shadow reaches, how its end is softened and itself smoothed, in radii of the hole, and the largest factor
 by which it is lit. Chosen on the second scene."""
 _SOFT = 1.0
