@@ -123,6 +123,6 @@ def test_the_light_of_a_shadow_beside_the_hole_is_what_it_lacks_and_elsewhere_it
     assert found.min() >= 1, "nothing turns darker"
     plain = np.full((SIZE, SIZE, 3), 0.4)
     np.testing.assert_array_equal(light(plain, hole, trust_outside(hole)), 1)
-    assert np.abs(light(original, hole, trust_outside(hole)) - 1).max() < 0.1, (
+    assert np.abs(light(original, hole, trust_outside(hole)) - 1).max() < 0.15, (
         "without a shadow nothing changes"
     )

@@ -49,6 +49,8 @@ shadows, too, so the median is too dark."""
 _SHADOW, _FADE, _SOFTNESS, _MOST = 1.5, 0.5, 0.1, 2.0
 """How far a shadow reaches, how its end is softened and itself smoothed, in radii of the hole, and the largest factor
 by which it is lit. Chosen on the second scene."""
+_WHITE = 0.9
+"""Share of the pixels that are darker than the brightest color that light makes: a red in the sun is not pure red."""
 _SOFT = 1.0
 """Excess of a shift's error over the least error, as a share of the latter, that reduces its weight to 1/e."""
 
@@ -138,7 +140,9 @@ def light(image: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     expected, actual = (
         mean_around(each, trust * asked, _SOFTNESS * repeats.radius) for each in (there, image @ _LUMINANCE)
     )
-    factor = (expected / np.maximum(actual, 0.02)).clip(1, _MOST)
+    brightest = np.quantile(image[trust > 0].max(-1), _WHITE)
+    limit = (brightest / np.maximum(image.max(-1), 0.02)).clip(1, _MOST)
+    factor = (expected / np.maximum(actual, 0.02)).clip(1, limit)
     near = ((_SHADOW - repeats.away) / _FADE).clip(0, 1)
     return np.asarray(1 + (factor - 1) * near)
 
