@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lexsplat.scenes.completing import completed, painted, self_similar_shifts
+from lexsplat.scenes.completing import completed, light, painted, self_similar_shifts
 
 SIZE, SQUARE, TURN = 112, 9.3, 0.4
 WHITE, BLUE, WOOD = np.array([0.8, 0.78, 0.75]), np.array([0.15, 0.35, 0.75]), np.array([0.6, 0.4, 0.25])
@@ -91,3 +91,38 @@ def test_a_hole_takes_the_colors_around_by_inverse_squared_distance():
     found = painted(image, hole, trust_outside(hole))[:, 0]
     expected = [(0.2 + 0.8 / 9) / (1 + 1 / 9), 0.5, (0.2 / 9 + 0.8) / (1 / 9 + 1)]
     np.testing.assert_allclose(found, expected)
+
+
+@pytest.mark.slow
+def test_at_the_edge_of_a_cloth_most_of_the_hole_is_cloth_or_wood_and_nothing_between():
+    original, (hole, _) = checkers(4.0), disk()
+    found = completed(original, hole, trust_outside(hole))
+    apart = np.linalg.norm(found[:, None] - np.stack([WHITE, BLUE, WOOD]), axis=-1).min(1)
+    assert (apart < 0.05).mean() > 0.8
+
+
+@pytest.mark.slow
+def test_a_pattern_goes_on_with_sharp_edges_and_the_same_each_time():
+    original, (hole, _) = checkers(), disk()
+    random = np.random.default_rng(0)
+    noisy = (original + random.normal(0, 0.03, original.shape)).clip(0, 1)
+    found = completed(noisy, hole, trust_outside(hole))
+    apart = np.linalg.norm(found[:, None] - np.stack([WHITE, BLUE]), axis=-1).min(1)
+    assert (apart < 0.15).mean() > 0.95, "copied, and no mean of white and blue"
+    np.testing.assert_array_equal(found, completed(noisy, hole, trust_outside(hole)))
+
+
+@pytest.mark.slow
+def test_the_light_of_a_shadow_beside_the_hole_is_what_it_lacks_and_elsewhere_it_is_1():
+    original, (hole, away) = checkers(), disk(14)
+    shadow = 1 - 0.4 * np.exp(-((np.maximum(away - 14, 0) / 8) ** 2))
+    found = light(original * shadow[..., None], hole, trust_outside(hole))
+    beside, far = (away > 15) & (away < 18), away > 45
+    assert np.abs(found[beside] * shadow[beside] - 1).mean() < 0.15
+    np.testing.assert_array_equal(found[far], 1)
+    assert found.min() >= 1, "nothing turns darker"
+    plain = np.full((SIZE, SIZE, 3), 0.4)
+    np.testing.assert_array_equal(light(plain, hole, trust_outside(hole)), 1)
+    assert np.abs(light(original, hole, trust_outside(hole)) - 1).max() < 0.15, (
+        "without a shadow nothing changes"
+    )

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 from support.language_scene import make_codebook
 
 from lexsplat.geometry.boxes import Up
@@ -17,6 +18,7 @@ from lexsplat.rendering import render
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.filling import Fill, fill_for
+from lexsplat.scenes.journal import Step
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.views import StoredView
 
@@ -191,6 +193,12 @@ def number_of_sources(fill):
     return {**fill, "gaussians": fill["gaussians"] + 1}
 
 
+def brightened(lit, light):
+    """A fill of no Gaussians that only brightens some."""
+    none = np.zeros(0, "<i4"), np.zeros((0, 13), "<f4")
+    return Fill(*none, np.array(lit, "<i4"), np.array(light, "<f4")).to_json()
+
+
 @pytest.mark.parametrize(
     "broken",
     [
@@ -202,6 +210,12 @@ def number_of_sources(fill):
         lambda fill: Fill(np.array([10**6], "<i4"), np.zeros((1, 13), "<f4")).to_json(),
         lambda fill: Fill(np.zeros(1, "<i4"), np.full((1, 13), np.nan, "<f4")).to_json(),
         lambda fill: "fill",
+        lambda fill: {**fill, "lit": fill.get("lit", 0) + 1},
+        lambda fill: {**fill, "lit": -1},
+        lambda fill: {**fill, "light": None},
+        lambda fill: brightened([10**6], [1.5]),
+        lambda fill: brightened([0], [np.nan]),
+        lambda fill: brightened([0], [0.0]),
     ],
 )
 def test_a_damaged_fill_is_reported_in_one_line(journaled_fill, tmp_path, broken):
@@ -280,6 +294,49 @@ def test_checkers_go_on_where_a_box_stood_and_nothing_of_its_color_stays(shadow)
     assert psnr[False] < 15, psnr
     red = pictures[True][..., 0] - pictures[True][..., 1:].max(-1)
     assert (red[seen] < 0.2).all(), "neither the box nor the remains under it"
+
+
+def test_a_shadow_around_a_deleted_thing_goes_with_it_and_comes_back_with_undo(tmp_path):
+    scene, alone = checkered_table_with_a_box(shadow=True)
+    editor = Editor(scene, tmp_path / "edits.jsonl")
+    editor.delete(box_of(scene))
+    kept = ~editor.steps[0].mask
+    places = scene.gaussians.means[kept].double().numpy()
+    far = np.abs(places[:, :2]).max(1)
+    own = cKDTree(alone.gaussians.means.double().numpy()).query(places)[1]
+    true = alone.gaussians.sh0[own, 0].numpy()
+    before, after = (
+        gaussians.sh0[: len(places), 0].numpy()
+        for gaussians in (scene.gaussians.select(kept), editor.scene.gaussians)
+    )
+    beside = (far > 0.3) & (far < 0.4)
+    assert np.abs(after - true)[beside].mean() < 0.7 * np.abs(before - true)[beside].mean()
+    np.testing.assert_array_equal(after[far > 1.2], before[far > 1.2])
+    again = Editor(scene, tmp_path / "edits.jsonl")
+    assert torch.equal(again.scene.gaussians.sh0, editor.scene.gaussians.sh0)
+    assert editor.undo()
+    assert torch.equal(editor.scene.gaussians.sh0, scene.gaussians.sh0)
+
+
+def test_steps_of_earlier_versions_which_brighten_nothing_are_replayed(journaled_fill, tmp_path):
+    scene, header, step = journaled_fill
+    fill = {name: value for name, value in step["fill"].items() if name in ("gaussians", "disks")}
+    (tmp_path / "edits.jsonl").write_text(f"{header}\n{json.dumps({**step, 'fill': fill})}\n")
+    after = Editor(scene, tmp_path / "edits.jsonl").scene.gaussians
+    kept = scene.gaussians.select(~Step.from_json(step).mask)
+    assert torch.equal(after.sh0[: len(kept)], kept.sh0)
+
+
+def test_what_two_things_brighten_is_brightened_once_by_the_larger_factor():
+    gaussians = gaussians_from_points(np.eye(3), np.full((3, 3), 0.4), sh_degree=1, opacity=0.9)
+    gaussians.shN.fill_(0.1)
+    none = np.zeros(0, "<i4"), np.zeros((0, 13), "<f4")
+    fill = Fill(*none, np.array([0, 1, 1], "<i4"), np.array([1.5, 1.25, 1.5], "<f4"))
+    found = Fill.from_json(json.loads(json.dumps(fill.to_json()))).relit(gaussians)
+    colors = found.sh0[:, 0].numpy() * 0.28209479177387814 + 0.5
+    np.testing.assert_allclose(colors, np.array([0.6, 0.6, 0.4])[:, None] * np.ones(3), atol=1e-6)
+    np.testing.assert_allclose(found.shN[:, 0, 0].numpy(), [0.15, 0.15, 0.1], atol=1e-6)
+    assert torch.equal(gaussians.shN, torch.full_like(gaussians.shN, 0.1)), "the scene itself stays"
 
 
 def test_specks_that_only_a_deleted_thing_hid_go_with_it_and_others_stay():

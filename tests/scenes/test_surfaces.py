@@ -42,3 +42,15 @@ def test_the_plane_of_many_points_takes_no_more_passes_over_them(monkeypatch):
         passes.clear()
         assert surface_below(*table_and_thing(count), UP) is not None
         assert len(passes) < 20
+
+
+def test_few_and_uneven_points_of_a_table_make_a_plane_too_and_scattered_ones_do_not():
+    random = np.random.default_rng(3)
+    thing = random.uniform((-0.2, -0.2, 0.5), (0.2, 0.2, 0.9), (200, 3))
+    uneven = np.concatenate([random.uniform(-0.35, 0.35, (45, 2)), random.uniform(0.46, 0.54, (45, 1))], 1)
+    found = surface_below(thing, uneven, UP)
+    assert found is not None
+    assert found.axes[2] @ UP > 0.97
+    assert found.origin[2] == pytest.approx(0.5, abs=0.02)
+    scattered = random.uniform((-0.35, -0.35, -1), (0.35, 0.35, 2), (120, 3))
+    assert surface_below(thing, scattered, UP) is None

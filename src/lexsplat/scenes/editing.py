@@ -85,11 +85,14 @@ def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Ga
 def _without(
     gaussians: Gaussians, language: LanguageField, kept: Tensor, step: Step
 ) -> tuple[Gaussians, LanguageField]:
-    """Some Gaussians of a scene and those of the fill of a step, which take the language of their sources."""
+    """Some Gaussians of a scene and those of the fill of a step, which take the language of their sources.
+
+    What the fill brightens of the former loses the shadow of what was there.
+    """
     if "fill" not in step.values:
         return gaussians.select(kept), language.select(kept)
     fill = Fill.from_json(step.values["fill"])
-    remain, added = gaussians.select(kept), fill.gaussians(gaussians)
+    remain, added = fill.relit(gaussians).select(kept), fill.gaussians(gaussians)
     sources = torch.from_numpy(fill.sources.astype(np.int64)).to(kept.device)
     tensors: dict[str, Any] = {
         name: torch.cat([tensor, getattr(added, name)]) for name, tensor in remain.tensors().items()

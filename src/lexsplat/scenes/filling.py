@@ -8,6 +8,8 @@
    painted pixel becomes a flat Gaussian. It takes the language of what it continues: of a neighbor in the surface,
    near by and of a like color (`_sources`). Under a thing at the edge of a cloth, a part of the fill is cloth and the
    rest is table.
+4. The surface around the hole keeps the shadow of the thing. Its Gaussians there are brightened
+   (`lexsplat.scenes.completing.light`), and the fill continues what they are then.
 
 Where no plane is found, such as below a hanging lamp, nothing is filled.
 """
@@ -36,7 +38,7 @@ from lexsplat.language.segments import Segments
 from lexsplat.queries.colors import cielab
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.progress import Event, Listener, silent
-from lexsplat.scenes.completing import completed
+from lexsplat.scenes.completing import completed, light
 from lexsplat.scenes.surfaces import (
     FEWEST,
     REACH,
@@ -80,44 +82,71 @@ _OPAQUE = 3.0
 _FLAT, _LARGE = 0.5, 0.25
 """A segment of which less is flat rises from the surface, unless it is this share of the scene, as a group is."""
 _COLUMNS = 13
+_BRIGHTEST = 100.0
+_LEAST_LIGHT = 0.01
+"""Change of brightness below which a Gaussian stays as it is: nobody sees it, and a step lists each that changes."""
 _MOST = 1 << 20
 
 
 class Fill(NamedTuple):
-    """Gaussians that close a hole.
+    """Gaussians that close a hole, and those around it that lose the shadow of a thing.
 
     Args:
         sources: The Gaussian whose language each takes ``[F]``.
         disks: Means, rotations (wxyz), logarithms of sizes, and RGB ``[F, 13]`` float32.
+        lit: Gaussians of the scene that are brightened ``[L]``.
+        factors: By how much ``[L]`` float32.
     """
 
     sources: NDArray[np.int32]
     disks: NDArray[np.float32]
+    lit: NDArray[np.int32] = np.zeros(0, "<i4")
+    factors: NDArray[np.float32] = np.zeros(0, "<f4")
 
     def to_json(self) -> dict[str, Any]:
         """Plain data."""
-        raw = zlib.compress(self.sources.tobytes() + self.disks.tobytes(), 6)
-        return {"gaussians": len(self.sources), "disks": base64.b64encode(raw).decode("ascii")}
+        return {
+            "gaussians": len(self.sources),
+            "disks": _packed(self.sources, self.disks),
+            "lit": len(self.lit),
+            "light": _packed(self.lit, self.factors),
+        }
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Fill:
-        """The inverse of `to_json`.
+        """The inverse of `to_json`; earlier versions brighten nothing.
 
         Raises:
             ValueError: If the data are not a fill.
         """
         try:
-            count = data["gaussians"]
-            if type(count) is not int or not 0 <= count <= _MOST:
-                raise ValueError(f"not a fill of {count!r} Gaussians"[:100])
-            size = count * 4 * (1 + _COLUMNS)
-            raw = zlib.decompressobj().decompress(base64.b64decode(data["disks"]), size + 1)
+            sources, disks = _unpacked(data["disks"], data["gaussians"], _COLUMNS)
+            if "lit" not in data:
+                return cls(sources, disks)
+            lit, factors = _unpacked(data["light"], data["lit"], 1)
         except (KeyError, TypeError, binascii.Error, zlib.error) as error:
             raise ValueError(f"not a fill: {error!r}") from error
-        if len(raw) != size:
-            raise ValueError(f"not a fill: {len(raw)} bytes for {count} Gaussians")
-        disks = np.frombuffer(raw, "<f4", offset=4 * count).reshape(count, _COLUMNS)
-        return cls(np.frombuffer(raw, "<i4", count), disks)
+        return cls(sources, disks, lit, factors[:, 0])
+
+    def relit(self, scene: Gaussians) -> Gaussians:
+        """The scene with its brightened Gaussians; one that is listed twice takes the larger factor.
+
+        Raises:
+            ValueError: If a Gaussian is not in the scene, or a factor is not in 0..100.
+        """
+        if not len(self.lit):
+            return scene
+        if not 0 <= self.lit.min() <= self.lit.max() < len(scene):
+            raise ValueError("the fill is for another number of Gaussians")
+        if not ((self.factors > 0) & (self.factors <= _BRIGHTEST)).all():
+            raise ValueError(f"the fill brightens by a factor that is not in 0..{_BRIGHTEST:g}")
+        factors = np.zeros(len(scene), np.float32)
+        np.maximum.at(factors, self.lit, self.factors)
+        by = torch.from_numpy(np.where(factors > 0, factors, np.float32(1)))[:, None, None].to(scene.sh0)
+        unlit = (by == 1)[:, 0]
+        sh0 = ((scene.sh0 * SH_C0 + 0.5) * by - 0.5) / SH_C0
+        sh0[unlit] = scene.sh0[unlit]  # to the last bit
+        return replace(scene, sh0=sh0, shN=scene.shN * by)
 
     def gaussians(self, scene: Gaussians) -> Gaussians:
         """The Gaussians, with as many coefficients as those of a scene.
@@ -145,6 +174,29 @@ class Fill(NamedTuple):
         return found
 
 
+def _packed(numbers: NDArray[np.int32], rows: NDArray[np.float32]) -> str:
+    """Integers ``[F]`` and rows ``[F]`` or ``[F, C]`` as text."""
+    raw = zlib.compress(numbers.tobytes() + rows.tobytes(), 6)
+    return base64.b64encode(raw).decode("ascii")
+
+
+def _unpacked(text: Any, count: Any, columns: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """The inverse of `_packed`.
+
+    Raises:
+        ValueError: If the text is not so many rows.
+    """
+    if type(count) is not int or not 0 <= count <= _MOST:
+        raise ValueError(f"not a fill of {count!r} Gaussians"[:100])
+    size = count * 4 * (1 + columns)
+    raw = zlib.decompressobj().decompress(base64.b64decode(text), size + 1)
+    if len(raw) != size:
+        raise ValueError(f"not a fill: {len(raw)} bytes for {count} Gaussians")
+    return np.frombuffer(raw, "<i4", count), np.frombuffer(raw, "<f4", offset=4 * count).reshape(
+        count, columns
+    )
+
+
 def fill_for(
     chosen: Selection,
     cameras: Sequence[Camera] = (),
@@ -152,7 +204,7 @@ def fill_for(
     hidden: Tensor | None = None,
     segments: Segments | None = None,
 ) -> tuple[Fill | None, Tensor]:
-    """The Gaussians that close the surfaces under a deleted selection, and those that are deleted with it.
+    """What closes the surfaces under a deleted selection, and the Gaussians that are deleted with it.
 
     Args:
         chosen: The selection.
@@ -214,15 +266,20 @@ def _fill_below(
     known = (coverage >= _BARE) & level & ~binary_dilation(hole, iterations=_RIM)
     if not hole.any() or known.sum() < FEWEST:
         return None
-    painted = completed(photo.colors, hole, known * (_UNSEEN + photo.shown))
+    trust = known * (_UNSEEN + photo.shown)
+    factors = light(photo.colors, hole, trust)
+    painted = completed(photo.colors.clip(0, 1) * factors[..., None], hole, trust)
     thin = flat & (np.abs(local[:, 2]) <= _WAVES * surface.radius)  # a banana on a cloth is none of its waves
     near = np.linalg.norm(local[:, :2] - surface.foot, axis=1) <= REACH * surface.radius
     counted = solid & near & ~gone & (shown | ~shown.any())  # nobody knows what hidden Gaussians are
     low = counted & (local[:, 2] <= _WAVES * surface.radius)
-    members = np.flatnonzero(thin & ~inside & counted & _of_surface(low, counted, segments))
+    surfaces = _of_surface(low, counted, segments)
+    members = np.flatnonzero(thin & ~inside & counted & surfaces)
     if not len(members):
         members = np.flatnonzero(flat & ~inside)
     gone |= inside
+    by = np.where(flat & surfaces & ~gone, _at(factors, local[:, :2], photo), 1.0)
+    lit = np.flatnonzero(by > 1 + _LEAST_LIGHT)
     waves = known & (np.abs(heights) <= _WAVES * surface.radius)
     raised = _continued(heights, hole, waves if waves.sum() >= FEWEST else known)
     places = np.concatenate([photo.cells[hole], raised[:, None]], 1)
@@ -233,7 +290,7 @@ def _fill_below(
     x, y, z, w = Rotation.from_matrix(surface.axes.T).as_quat()
     same = np.tile([w, x, y, z, *np.log(photo.size * np.array(_SIZES))], (len(painted), 1))
     disks = np.concatenate([surface.origin + places @ surface.axes, same, painted], 1).astype("<f4")
-    return Fill(members[nearest].astype("<i4"), disks)
+    return Fill(members[nearest].astype("<i4"), disks, lit.astype("<i4"), by[lit].astype("<f4"))
 
 
 def _of_surface(low: Mask, counted: Mask, segments: Segments | None) -> Mask:
@@ -303,13 +360,13 @@ def _revealed(views: Views, own: Mask, gone: Mask) -> Mask:
     return found
 
 
-def _at(mask: Mask, points: FloatArray, photo: Orthophoto) -> Mask:
-    """Whether points ``[N, 2]`` of the plane lie in pixels of a mask."""
-    (first, *_), count = photo.cells[0], len(mask)
+def _at(image: NDArray, points: FloatArray, photo: Orthophoto) -> NDArray:
+    """The pixels ``[N]`` of an image ``[P, P]`` in which points ``[N, 2]`` of the plane lie; 0 outside."""
+    (first, *_), count = photo.cells[0], len(image)
     columns = np.round((points[:, 0] - first[0]) / photo.size).astype(int)
     rows = np.round((first[1] - points[:, 1]) / photo.size).astype(int)
     inside = (columns >= 0) & (columns < count) & (rows >= 0) & (rows < count)
-    return inside & mask[rows.clip(0, count - 1), columns.clip(0, count - 1)]
+    return image[rows.clip(0, count - 1), columns.clip(0, count - 1)] * inside
 
 
 def _continued(heights: FloatArray, hole: Mask, known: Mask) -> FloatArray:

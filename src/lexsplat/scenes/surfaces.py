@@ -30,8 +30,9 @@ _FOOT = 0.15
 """The foot of a thing: its lowest share by height."""
 _RING = 1.0
 """Width of the ring around the foot whose Gaussians make the plane, in radii of the foot."""
-_LEVEL = 0.1
-"""Gaussians of the ring within this distance of the plane belong to it, in radii of the foot."""
+_LEVELS = (0.1, 0.2)
+"""Gaussians of the ring within this distance of the plane belong to it, in radii of the foot. The second is taken
+where too few are within the first: wood has few Gaussians."""
 THICK = 0.3
 """Gaussians within this distance of the plane are the surface that is seen from above, in radii of the foot."""
 _STEEPEST = 0.8
@@ -86,7 +87,8 @@ def surface_below(own: FloatArray, others: FloatArray, up: FloatArray) -> Surfac
     apart = np.linalg.norm(others @ np.stack([right, ahead]).T - center, axis=1)
     near = np.abs(others @ up - low) <= 0.5 * radius
     ring = others[near & (apart <= (1 + _RING) * radius)]
-    plane = _fitted_plane(ring, up, _LEVEL * radius) if len(ring) >= FEWEST else None
+    planes = (_fitted_plane(ring, up, level * radius) for level in _LEVELS) if len(ring) >= FEWEST else ()
+    plane = next((each for each in planes if each is not None), None)
     if plane is None:
         return None
     origin, normal = plane
