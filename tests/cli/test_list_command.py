@@ -83,6 +83,23 @@ def test_the_table_has_the_likeliest_names_their_probabilities_and_how_each_box_
         assert abs(thing.box.axes[0] @ along) == pytest.approx(1, abs=1e-4)
 
 
+def test_a_name_in_another_case_is_the_same_name_in_its_first_spelling(demo, tmp_path, capsys):
+    file = tmp_path / "names.txt"
+    file.write_text("Mug\nMUG\n mug\napple\nAPPLE \n", encoding="utf-8")
+    assert cli.main(["list", "demo", "--vocabulary", str(file), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["words"] == 2
+    found = [(thing["name"], thing["names"][0]["probability"]) for thing in document["objects"]]
+    alone = [
+        (thing.phrase.replace("mug", "Mug"), round(thing.names[0][1], 4))
+        for thing in objects_of(demo, ["mug", "apple"])
+    ]
+    assert found == alone, "one name is as likely as in a vocabulary that has it once"
+    assert "Mug" in dict(found)
+    assert {thing.phrase for thing in objects_of(demo, ["mug", " MUG", "apple"])} == {"mug", "apple"}
+    assert list_document(demo, ["mug", "MUG"])["words"] == 1
+
+
 @pytest.mark.slow
 def test_thumbnails_show_the_objects_and_dim_what_is_around(demo, tmp_path):
     document = list_document(demo, (), tmp_path / "new" / "sheet.png")

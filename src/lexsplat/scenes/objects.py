@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,7 +44,7 @@ _FAR_BETTER = 0.5
 
 
 def read_vocabulary(path: Path) -> list[str]:
-    """The phrases of a text file, one a line; empty lines and lines that start with # are skipped.
+    """The phrases of a text file, one a line, each once; empty lines and lines that start with # are skipped.
 
     Raises:
         FileFormatError: If the file cannot be read, is not text, is too large or has no phrase.
@@ -68,7 +68,7 @@ def read_vocabulary(path: Path) -> list[str]:
     except UnicodeDecodeError as error:
         raise refused("text in UTF-8", f"other bytes at {error.start}") from error
     lines = (" ".join(line.split()) for line in text.splitlines())
-    phrases = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
+    phrases = distinct_names(line for line in lines if line and not line.startswith("#"))
     if not phrases:
         raise refused("at least one name", "none")
     for line in phrases:
@@ -82,12 +82,21 @@ def read_vocabulary(path: Path) -> list[str]:
     return phrases
 
 
+def distinct_names(names: Iterable[str]) -> list[str]:
+    """Names without those that differ from an earlier one only by case or by spaces."""
+    found: dict[str, str] = {}
+    for name in names:
+        found.setdefault(" ".join(name.casefold().split()), name)
+    return list(found.values())
+
+
 def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection, ...]:
     """The objects of a scene, those that the views show most of first.
 
     Args:
         scene: The scene.
-        vocabulary: Candidate names of the objects; () takes the everyday names of `lexsplat.queries.vocabulary`.
+        vocabulary: Candidate names of the objects, in any case; () takes the everyday names of
+            `lexsplat.queries.vocabulary`.
 
     The listener of the scene receives events of stage "objects", one for each name.
 
@@ -97,7 +106,7 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     Raises:
         QueryError: If a phrase is empty.
     """
-    words = check_prompts(list(vocabulary) or default_vocabulary(scene.clip))
+    words = distinct_names(check_prompts(list(vocabulary) or default_vocabulary(scene.clip)))
     if scene.field.segments is None:
         return _named_by_words(scene, words)
     classifier, segments, texts = scene.presence_classifier, scene.field.segments, scene.embed(words)
@@ -207,7 +216,7 @@ def list_document(
         "scene": str(scene.folder.root) if scene.folder else None,
         "rests_on": rests_on(scene),
         **scene.world.to_json(),
-        "words": len(vocabulary) or len(default_vocabulary(scene.clip)),
+        "words": len(distinct_names(vocabulary)) or len(default_vocabulary(scene.clip)),
         "note": "" if scene.field.segments else f"no segments: each word is looked for; {NO_SEGMENTS}",
         "picture": None if picture is None else str(picture),
         "objects": [_entry(scene, thing) for thing in things],
