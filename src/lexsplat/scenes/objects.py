@@ -10,17 +10,19 @@ import numpy as np
 import torch
 
 from lexsplat.queries.objects import (
+    WholeSegments,
     likeliest_things,
     name_probabilities,
     pieces_of_others,
     whole_segments,
+    with_surfaces,
 )
 from lexsplat.queries.pieces import level_with
 from lexsplat.queries.presence import FAINT
 from lexsplat.queries.relations import same
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import SMALLEST_SHARE, Selection
-from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary, gives_way
+from lexsplat.queries.vocabulary import STUFF, SURFACES, default_vocabulary, gives_way, is_divided
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.progress import Event
 from lexsplat.scenes.answers import find_best_views, rests_on
@@ -29,6 +31,7 @@ from lexsplat.scenes.pixels import object_colors, shown_weights
 from lexsplat.scenes.sheet import write_sheet
 
 if TYPE_CHECKING:
+    from lexsplat.language.segment_codes import SegmentCodes
     from lexsplat.scenes.scene import Scene
 
 MAX_WORDS = 2000
@@ -113,11 +116,7 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     codes = classifier.segment_codes
     if codes is None:
         return ()
-    whole = whole_segments(
-        codes,
-        lambda part: classifier.strengths(texts[part], codes.distributions),
-        [gives_way(word) for word in words],
-    )
+    whole = _whole_segments(scene, words, texts, codes)
     numbers = np.where(whole.places < 0, -1, whole.words[whole.places])
     known = np.unique(numbers[numbers >= 0])
     if len(known) == 0:
@@ -151,6 +150,23 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     return tuple(sorted(found, key=lambda each: -float(segments.masses[each.indices].sum())))
 
 
+def _whole_segments(
+    scene: Scene, words: Sequence[str], texts: torch.Tensor, codes: SegmentCodes
+) -> WholeSegments:
+    """The segments that are objects, by words with embeddings ``[W, D]``; surfaces have their names."""
+    classifier = scene.presence_classifier
+    whole = whole_segments(
+        codes,
+        lambda part: classifier.strengths(texts[part], codes.distributions),
+        [gives_way(word) for word in words],
+    )
+    surfaces = np.flatnonzero([word.lower() in STUFF or is_divided(word) for word in words])
+    if not len(surfaces):
+        return whole
+    strengths = classifier.strengths(texts[surfaces], codes.distributions)
+    return with_surfaces(whole, codes.masses, surfaces, strengths)
+
+
 def _with_pieces_apart(
     scene: Scene, surface: torch.Tensor, pieces: torch.Tensor, things: torch.Tensor
 ) -> torch.Tensor:
@@ -166,7 +182,7 @@ def _with_pieces_apart(
     """
     if not bool((surface & (things >= 0)).any()):
         return pieces
-    chosen = scene.selection(surface, torch.zeros_like(scene.field.segments.masses))
+    chosen = scene.selection(surface, scene.gaussians.opacities.detach())
     labels, weights = chosen._clusters()
     like = things[chosen.indices].cpu().numpy()
     opacities = scene.gaussians.opacities[chosen.indices].detach().cpu().double().numpy()
