@@ -6,7 +6,16 @@ import torch
 
 from lexsplat.language.segment_codes import SegmentCodes, segment_codes
 from lexsplat.language.segments import Segments
-from lexsplat.queries.colors import COLOR_WORDS, NEAR, cielab, color_told, color_words, may_be
+from lexsplat.queries.colors import (
+    COLOR_WORDS,
+    METALS,
+    NEAR,
+    cielab,
+    color_told,
+    color_words,
+    colors_expected,
+    may_be,
+)
 from lexsplat.queries.objects import (
     WholeSegments,
     likeliest_things,
@@ -129,6 +138,14 @@ def test_a_thing_may_have_a_color_that_light_or_shade_turns_into_another_one():
     assert (color_told("Grey mug"), color_told("orange"), color_told("red and white cloth")) == (
         {"gray"}, set(), {"red", "white"},
     )  # fmt: skip
+
+
+def test_a_thing_of_metal_is_seen_in_the_colors_of_the_metal():
+    assert {word for colors in METALS.values() for word in colors.split()} <= set(COLOR_WORDS)
+    assert colors_expected("Golden ring") == colors_expected("gold ring") == {"yellow", "orange", "brown"}
+    assert colors_expected("red and silver ball") == {"red", "gray", "white"}
+    assert colors_expected("gold") == colors_expected("ring") == set(), "the thing itself has no color told"
+    assert color_told("gold ring") == set(), "not every yellow ring is of gold"
 
 
 def test_a_segment_of_a_surface_that_a_thing_names_better_may_be_its_piece():

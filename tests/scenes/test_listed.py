@@ -203,3 +203,15 @@ def test_the_floor_is_one_floor_though_other_words_describe_it_as_well(demo):
     assert "whisk" not in names
     assert names.count("table") + names.count("desk") == 1
     assert len(names) == len(demo.objects)
+
+
+@pytest.mark.slow
+def test_a_ring_that_was_gold_is_unsure_as_a_gold_ring_once_it_is_blue(demo, tmp_path):
+    assert [demo.find(f"{metal} ring").present for metal in ("gold", "golden")] == ["yes", "yes"]
+    editor = Editor(demo)
+    editor.recolor(demo.select("gold ring"), (0.0, 0.0, 1.0))
+    blue = editor.scene
+    found = blue.find("gold ring")
+    assert (found.present, found.note) == ("unsure", "the ring is mainly blue")
+    assert blue.find("golden ring").present == "unsure"
+    assert [blue.find(phrase).present for phrase in ("blue ring", "metal ring")] == ["yes", "yes"]
