@@ -70,6 +70,36 @@ def test_a_vocabulary_names_the_things(demo, tmp_path, capsys):
     assert objects_of(demo, ["unicorn", "swimming pool"]) == ()
 
 
+def test_the_table_has_the_likeliest_names_their_probabilities_and_how_each_box_is_turned(capsys, demo):
+    assert cli.main(["list", "demo", "--csv"]) == 0
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert [row["names"].split(";") for row in rows] == [[name for name, _ in o.names] for o in demo.objects]
+    for row, thing in zip(rows, demo.objects, strict=True):
+        shares = [float(share) for share in row["probabilities"].split(";")]
+        assert shares == pytest.approx([share for _, share in thing.names], abs=1e-4)
+        assert (row["name"], float(row["probability"])) == (row["names"].split(";")[0], shares[0])
+        turned = np.radians(float(row["box_angle_degrees"]))
+        along = np.array([np.cos(turned), np.sin(turned), 0])  # the demo's z axis points up
+        assert abs(thing.box.axes[0] @ along) == pytest.approx(1, abs=1e-4)
+
+
+def test_a_name_in_another_case_is_the_same_name_in_its_first_spelling(demo, tmp_path, capsys):
+    file = tmp_path / "names.txt"
+    file.write_text("Mug\nMUG\n mug\napple\nAPPLE \n", encoding="utf-8")
+    assert cli.main(["list", "demo", "--vocabulary", str(file), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["words"] == 2
+    found = [(thing["name"], thing["names"][0]["probability"]) for thing in document["objects"]]
+    alone = [
+        (thing.phrase.replace("mug", "Mug"), round(thing.names[0][1], 4))
+        for thing in objects_of(demo, ["mug", "apple"])
+    ]
+    assert found == alone, "one name is as likely as in a vocabulary that has it once"
+    assert "Mug" in dict(found)
+    assert {thing.phrase for thing in objects_of(demo, ["mug", " MUG", "apple"])} == {"mug", "apple"}
+    assert list_document(demo, ["mug", "MUG"])["words"] == 1
+
+
 @pytest.mark.slow
 def test_thumbnails_show_the_objects_and_dim_what_is_around(demo, tmp_path):
     document = list_document(demo, (), tmp_path / "new" / "sheet.png")
@@ -105,7 +135,7 @@ def test_a_table_is_alone_on_standard_output_and_the_rest_is_told_beside_it(tmp_
     scene, sheet = str(shutil.copytree(old, tmp_path / "scene")), str(tmp_path / "sheet.png")
     assert cli.main(["list", scene, "--csv", "--images", "--output", sheet]) == 0
     found = capsys.readouterr()
-    assert {len(row) for row in csv.reader(io.StringIO(found.out))} == {17}
+    assert {len(row) for row in csv.reader(io.StringIO(found.out))} == {20}
     assert found.err.splitlines()[-2:] == ["no segments: each word is looked for; how to get them", sheet]
 
 

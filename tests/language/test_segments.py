@@ -110,34 +110,105 @@ def field(count: int, segments: Segments | None) -> CodeField:
     return CodeField(Codebook(torch.eye(3)), codes, weights, torch.zeros(count), segments=segments)
 
 
-def test_segments_are_stored_with_the_language_in_4_bytes_a_gaussian():
-    segments = Segments(
-        torch.tensor([0, 2, 1, 2]), torch.tensor([0.5, 0, 2, 9]), torch.tensor([[0, 1, 2], [0, 0, 1]])
-    )
-    tensors = field(4, segments).tensors()
-    per_gaussian = ("segments.labels", "segments.masses")
-    assert sum(tensors[name].numel() * tensors[name].element_size() for name in per_gaussian) == 4 * 4
-    opened = field_from_tensors(tensors).select(torch.tensor([3, 1])).segments
+def test_segments_are_stored_with_the_language_in_less_than_4_bytes_a_gaussian():
+    count, lowest = 8000, 300
+    generator = torch.Generator().manual_seed(0)
+    labels = torch.randint(0, lowest, (count,), generator=generator)
+    levels = torch.stack([torch.arange(lowest) >> level for level in range(4)])
+    hidden = torch.rand(count, generator=generator) < 0.1
+    added = hidden & (torch.rand(count, generator=generator) < 0.5)
+    segments = Segments(labels, torch.rand(count, generator=generator).half().float(), levels, hidden, added)
+    tensors = {
+        name: tensor
+        for name, tensor in field(count, segments).tensors().items()
+        if name.startswith("segments.")
+    }
+    assert sum(tensor.nbytes for tensor in tensors.values()) < 4 * count
+    opened = field_from_tensors(field(count, segments).tensors()).segments
     assert opened is not None
-    assert opened.labels.tolist() == [2, 2]
-    assert opened.masses.tolist() == [9, 0]
-    assert torch.equal(opened.levels, segments.levels)
+    for name in ("labels", "masses", "levels", "hidden", "added"):
+        assert torch.equal(getattr(opened, name), getattr(segments, name)), name
     assert field_from_tensors(field(4, None).tensors()).segments is None
 
 
+@pytest.mark.parametrize("count", [1, 7, 8, 9])
+def test_segments_of_any_number_of_gaussians_are_read_as_they_were(count):
+    labels = torch.arange(count) % 3
+    levels = torch.tensor([[2, 0, 1], [1, 1, 0], [0, 0, 0]])  # numbers need no order
+    segments = Segments(labels, torch.ones(count), levels)
+    opened = Segments.from_tensors(segments.tensors())
+    assert opened is not None
+    assert torch.equal(opened.labels, labels)
+    assert torch.equal(opened.levels, levels)
+    assert (opened.hidden, opened.added) == (None, None)
+
+
+def earlier(**changed) -> dict[str, torch.Tensor]:
+    """Segments as earlier versions stored them."""
+    found = {
+        "labels": torch.tensor([0, 2, 1, 2], dtype=torch.uint16),
+        "masses": torch.ones(4).half(),
+        "levels": torch.tensor([[0, 1, 2], [0, 0, 1]], dtype=torch.int32),
+    }
+    found = {name: value for name, value in (found | changed).items() if value is not None}
+    return {f"segments.{name}": value for name, value in found.items()}
+
+
+def test_segments_of_earlier_versions_are_read():
+    opened = Segments.from_tensors(earlier(hidden=torch.tensor([0, 1, 2, 0], dtype=torch.uint8)))
+    assert opened is not None
+    assert opened.labels.tolist() == [0, 2, 1, 2]
+    assert opened.levels.tolist() == [[0, 1, 2], [0, 0, 1]]
+    assert opened.hidden.tolist() == [False, True, True, False]
+    assert opened.added.tolist() == [False, False, True, False]
+
+
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("changed", "told"),
     [
-        ("labels", torch.tensor([0, 3, 1, 2])),
-        ("labels", torch.tensor([0, 1])),
-        ("masses", torch.tensor([0.5, -1, 2, 9])),
-        ("levels", torch.tensor([[0, 1, 7]])),
-        ("levels", torch.zeros(0, 3, dtype=torch.int64)),
-        ("levels", None),
+        ({"labels": torch.tensor([0, 3, 1, 2])}, "labels must be in 0..2"),
+        ({"labels": torch.tensor([0, 1])}, r"labels \[N\]"),
+        ({"labels": torch.tensor([0.2, 2, 1, 2])}, "labels must be integers, got torch.float32"),
+        ({"masses": torch.tensor([0.5, -1, 2, 9])}, "masses must not be negative"),
+        ({"masses": torch.zeros(4)}, "some of them positive"),
+        ({"masses": torch.tensor([1, math.nan, 1, 1])}, "masses must be finite"),
+        ({"masses": torch.ones(4, dtype=torch.int64)}, "masses must be floats"),
+        ({"levels": torch.tensor([[0, 1, 7]])}, "levels must be in 0..2"),
+        ({"levels": torch.tensor([[0, 1, 7], [0, 0, 0]])}, "levels must be in 0..2"),
+        ({"levels": torch.tensor([[0.0, 1, 2]])}, "levels must be integers"),
+        ({"levels": torch.tensor([[0, 0, 1], [0, 1, 2]])}, "levels must be nested"),
+        ({"levels": torch.zeros(0, 3, dtype=torch.int64)}, "need a level"),
+        ({"levels": None}, "segments lack levels"),
     ],
 )
-def test_stored_segments_that_do_not_fit_are_refused(name, value):
-    segments = Segments(torch.tensor([0, 2, 1, 2]), torch.ones(4), torch.tensor([[0, 1, 2]]))
+def test_segments_of_earlier_versions_that_do_not_fit_are_refused(changed, told):
+    with pytest.raises(ValueError, match=told):
+        Segments.from_tensors(earlier(**changed))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("label_bits", torch.full((2, 1), 255, dtype=torch.uint8), "labels must be in 0..2"),
+        ("label_bits", torch.zeros(2, 2, dtype=torch.uint8), "bits of 4 Gaussians expected"),
+        ("label_bits", torch.zeros(2, 1, dtype=torch.int64), "bits of 4 Gaussians expected"),
+        ("label_bits", None, "segments lack label_bits"),
+        ("label_bits", torch.tensor(0, dtype=torch.uint8), "label_bits .* expected"),
+        ("masses", torch.tensor(1.0), "masses .* expected"),
+        ("masses", torch.zeros(4), "some of them positive"),
+        ("masses", torch.ones(9), "bits of 9 Gaussians expected"),
+        ("parents", torch.tensor([0, 1, 2, 0, 0, 7]), "parents must be in 0..1"),
+        ("parents", torch.tensor([0, 1, 2, 0, 0]), "parents of .* segments expected"),
+        ("parents", torch.zeros(6), "parents must be integers"),
+        ("counts", torch.tensor([3, -3, 6]), "parents of .* segments expected"),
+        ("counts", torch.tensor([[3, 3, 2]]), "parents of .* segments expected"),
+        ("counts", torch.tensor([6]), "parents of .* segments expected"),
+        ("hidden_bits", torch.zeros(4, dtype=torch.uint8), "bits of 4 Gaussians expected"),
+    ],
+)
+def test_stored_segments_that_do_not_fit_are_refused(name, value, told):
+    levels = torch.tensor([[0, 1, 2], [0, 0, 1]])
+    segments = Segments(torch.tensor([0, 2, 1, 2]), torch.ones(4), levels)
     tensors = field(4, segments).tensors() | {f"segments.{name}": value}
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match=told):
         field_from_tensors({key: tensor for key, tensor in tensors.items() if tensor is not None})

@@ -6,12 +6,23 @@ import torch
 
 from lexsplat.language.segment_codes import SegmentCodes, segment_codes
 from lexsplat.language.segments import Segments
-from lexsplat.queries.colors import COLOR_WORDS, NEAR, cielab, color_told, color_words, may_be
+from lexsplat.queries.colors import (
+    COLOR_WORDS,
+    METALS,
+    NEAR,
+    cielab,
+    color_told,
+    color_words,
+    colors_expected,
+    may_be,
+)
 from lexsplat.queries.objects import (
+    WholeSegments,
     likeliest_things,
     name_probabilities,
     pieces_of_others,
     whole_segments,
+    with_surfaces,
 )
 
 LEVELS = torch.tensor([[0, 1, 2, 3, 4], [0, 0, 1, 2, 3], [0, 0, 1, 2, 2]])
@@ -129,6 +140,14 @@ def test_a_thing_may_have_a_color_that_light_or_shade_turns_into_another_one():
     )  # fmt: skip
 
 
+def test_a_thing_of_metal_is_seen_in_the_colors_of_the_metal():
+    assert {word for colors in METALS.values() for word in colors.split()} <= set(COLOR_WORDS)
+    assert colors_expected("Golden ring") == colors_expected("gold ring") == {"yellow", "orange", "brown"}
+    assert colors_expected("red and silver ball") == {"red", "gray", "white"}
+    assert colors_expected("gold") == colors_expected("ring") == set(), "the thing itself has no color told"
+    assert color_told("gold ring") == set(), "not every yellow ring is of gold"
+
+
 def test_a_segment_of_a_surface_that_a_thing_names_better_may_be_its_piece():
     #            table lamp
     strengths = [[0.9, 0.1], [0.1, 0.9], [0.1, 0.1], [0.1, 0.9], [0.1, 0.9], [0.9, 0.2], [0.1, 0.9]]
@@ -155,3 +174,44 @@ def test_the_likeliest_thing_needs_half_and_is_no_surface():
     lowest = np.array([0, 1, 2, 3, 1])
     assert likeliest_things(lowest, known, strengths, surfaces).tolist() == [5, 8, -1, -1, 8]
     assert likeliest_things(lowest, known, strengths, np.ones(3, bool)).tolist() == [-1] * 5
+
+
+def names_with_surfaces(strengths, words, masses, surfaces) -> list[int]:
+    """The words of objects of one lowest segment each, with surfaces named."""
+    table, own = np.array(strengths, float), np.array(words)
+    whole = WholeSegments(np.arange(len(own)), own, table[np.arange(len(own)), own])
+    found = with_surfaces(whole, np.array(masses, float), np.array(surfaces, int), table[:, surfaces])
+    assert found.places.tolist() == whole.places.tolist()
+    return found.words.tolist()
+
+
+def test_a_floor_that_resembles_a_thing_nearly_as_much_is_the_floor():
+    #            floor whisk mug
+    strengths = [[0.98, 0.90, 0.1], [0.98, 0.99, 0.1], [0.2, 0.3, 0.9]]
+    assert names_with_surfaces(strengths, [0, 1, 2], [5, 1, 1], [0]) == [0, 0, 2]
+    assert names_with_surfaces(strengths[1:], [1, 2], [1, 1], [0]) == [0, 2], "one piece alone"
+    strengths[1][1] = 1.05
+    assert names_with_surfaces(strengths, [0, 1, 2], [5, 1, 1], [0]) == [0, 1, 2], "less than half as likely"
+
+
+def test_a_thing_on_a_table_that_no_word_describes_well_is_not_the_table():
+    #            table ring
+    strengths = [[0.95, 0.1], [0.745, 0.75]]
+    assert names_with_surfaces(strengths, [0, 1], [5, 1], [0]) == [0, 1]
+
+
+def test_names_of_surfaces_that_are_alike_at_each_other_are_one_name():
+    #            table desk wall
+    strengths = [[0.95, 0.94, 0.1], [0.86, 0.87, 0.1], [0.66, 0.67, 0.2], [0.1, 0.2, 0.9]]
+    assert names_with_surfaces(strengths, [0, 1, 1, 2], [9, 2, 1, 5], [0, 1, 2]) == [0, 0, 0, 2]
+    assert names_with_surfaces(strengths, [0, 1, 1, 2], [2, 9, 1, 5], [0, 1, 2]) == [1, 1, 1, 2], (
+        "most is a desk"
+    )
+    strengths[0][1] = 0.5
+    assert names_with_surfaces(strengths, [0, 1, 1, 2], [9, 2, 1, 5], [0, 1, 2]) == [0, 1, 1, 2], (
+        "the desk may be a table, but the table is no desk"
+    )
+    strengths[0][1], strengths[1][0] = 0.94, 0.5
+    assert names_with_surfaces(strengths, [0, 1, 1, 2], [9, 2, 1, 5], [0, 1, 2]) == [0, 1, 1, 2], (
+        "most of the desk is no table"
+    )

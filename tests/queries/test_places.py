@@ -8,7 +8,7 @@ import torch
 from support.language_scene import LanguageScene, make_scene
 
 from lexsplat.geometry.world import World
-from lexsplat.queries.places import extent, lengths, position
+from lexsplat.queries.places import angle_of_box, extent, lengths, position
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import QueryError
 
@@ -78,3 +78,20 @@ def test_a_selection_grows_and_shrinks_by_meters_as_by_the_units_that_they_are(b
 def test_a_distance_that_has_no_meaning_is_refused(balls, scale, given, told):
     with pytest.raises(QueryError, match=told):
         ball(balls, 0, scale).grow(**given)
+
+
+@pytest.mark.parametrize(
+    ("first", "up", "degrees"),
+    [
+        ((1, 0, 0), (0, 0, 1), 0.0),
+        ((np.cos(0.5), np.sin(0.5), 0), (0, 0, 1), 28.6),
+        ((-np.cos(0.5), -np.sin(0.5), 0), (0, 0, 1), 28.6),
+        ((np.cos(0.5), -np.sin(0.5), 0), (0, 0, 1), 151.4),
+        ((np.cos(0.5), 0, np.sin(0.5)), (0, -1, 0), 28.6),
+        ((0, np.cos(0.5), np.sin(0.5)), (1, 0, 0), 28.6),
+        ((np.cos(1e-4), -np.sin(1e-4), 0), (0, 0, 1), 0.0),
+    ],
+    ids=["along x", "turned", "either way", "the other way", "y is down", "x is up", "all but none"],
+)
+def test_the_angle_of_a_box_is_counted_from_above_and_from_the_x_axis(first, up, degrees):
+    assert angle_of_box([first, np.cross(up, first), up]) == degrees

@@ -8,6 +8,7 @@ import pytest
 import torch
 from support.language_scene import CENTERS, RADIUS, LanguageScene, make_scene
 
+from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.errors import QueryError
 
@@ -176,3 +177,38 @@ def test_plain_data_counts_instances_and_lists_none_of_what_is_not_there(balls):
 def test_the_representation_of_a_selection_is_one_line(balls):
     text = repr(select(balls, balls.labels == 0, phrase="ball"))
     assert text == "Selection('ball', present='yes', gaussians=200, threshold=0.5)"
+
+
+class Shares:
+    """What views show of a selection, all of which are known."""
+
+    complete, names = True, ["near", "beside", "far"]
+
+    def __init__(self, beside: float, far: float) -> None:
+        self.known = sorted({"near": 1.0, "beside": beside, "far": far}.items(), key=lambda each: -each[1])
+
+    def shares(self, indices, promising, most=1):
+        assert promising is None
+        return self.known[:most]
+
+    def counted(self, indices):
+        return None
+
+
+@pytest.mark.parametrize(
+    ("beside", "far", "best"),
+    [(0.9, 0.85, "far"), (0.9, 0.79, "near"), (1.1, 0.85, "beside"), (1.1, 1.2, "far")],
+)
+def test_a_view_that_shows_a_thing_whole_wins_over_one_that_cuts_it_and_shows_hardly_more(
+    balls, beside, far, best
+):
+    """The near view cuts it at the left, and the one beside it at the top."""
+    place = np.eye(4)
+    place[:3, 3] = np.array([0, 0, 5]) - CENTERS[0]
+    middles = {"near": (0, 50), "beside": (50, 0), "far": (50, 50)}
+    cameras = {
+        name: Camera(100, 100, np.array([[100.0, 0, x], [0, 100, y], [0, 0, 1]]), place)
+        for name, (x, y) in middles.items()
+    }
+    thing = replace(ball(balls, 0), cameras=cameras, seen=Shares(beside, far))
+    assert thing.best_view == best

@@ -70,6 +70,24 @@ def test_what_is_kept_is_what_is_computed_without_it(demo_copy, demo):
 
 
 @pytest.mark.slow
+def test_the_best_view_shows_a_thing_whole_where_one_that_cuts_it_shows_hardly_more(demo):
+    bottle = next(thing for thing in demo.objects if thing.phrase == "bottle")
+
+    def drawn(name: str) -> torch.Tensor:
+        carried = bottle.mask[:, None].float()
+        return render(demo.gaussians, demo.cameras[name], features=carried, color=False).features[..., 0]
+
+    def at_border(image: torch.Tensor) -> float:
+        return float(torch.cat([image[[0, -1]].flatten(), image[:, [0, -1]].flatten()]).max())
+
+    images = {name: drawn(name) for name, _ in bottle.view_shares}
+    most, best = max(images.values(), key=torch.sum), drawn(bottle.best_view)
+    assert at_border(most) > 0.5, "the border cuts it in the view that shows most of it"
+    assert at_border(best) < 0.05
+    assert float(best.sum()) > 0.8 * float(most.sum())
+
+
+@pytest.mark.slow
 def test_what_the_first_questions_compute_is_counted(demo_copy, tmp_path):
     for name in (SEEN, OBJECTS):
         (demo_copy / name).unlink()

@@ -10,6 +10,7 @@ import torch
 
 from lexsplat import cli
 from lexsplat.queries.colors import is_qualified, unqualified, without_color
+from lexsplat.queries.vocabulary import default_vocabulary
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.listed import listed_as, refuse_doubtful
@@ -193,3 +194,24 @@ def test_nothing_of_a_deleted_bottle_is_left_above_the_table(demo):
     places = (left.means.double().numpy() - bottle.box.center) @ bottle.box.axes.T
     within = (abs(places) < 1.2 * bottle.box.half_sizes).all(1) & (left.means[:, 2].numpy() > 0.1)
     assert not (within & (left.opacities.numpy() > 0.1)).any()
+
+
+def test_the_floor_is_one_floor_though_other_words_describe_it_as_well(demo):
+    words = [*default_vocabulary("bundled"), "whisk", "desk"]
+    names = [each.phrase for each in objects_of(demo, words)]
+    assert names.count("floor") == 1
+    assert "whisk" not in names
+    assert names.count("table") + names.count("desk") == 1
+    assert len(names) == len(demo.objects)
+
+
+@pytest.mark.slow
+def test_a_ring_that_was_gold_is_unsure_as_a_gold_ring_once_it_is_blue(demo, tmp_path):
+    assert [demo.find(f"{metal} ring").present for metal in ("gold", "golden")] == ["yes", "yes"]
+    editor = Editor(demo)
+    editor.recolor(demo.select("gold ring"), (0.0, 0.0, 1.0))
+    blue = editor.scene
+    found = blue.find("gold ring")
+    assert (found.present, found.note) == ("unsure", "the ring is mainly blue")
+    assert blue.find("golden ring").present == "unsure"
+    assert [blue.find(phrase).present for phrase in ("blue ring", "metal ring")] == ["yes", "yes"]

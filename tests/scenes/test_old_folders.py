@@ -6,12 +6,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save_file
+from support.command_line import fails_in_one_line
 
 from lexsplat import cli, open_scene
 from lexsplat.queries.selection import Selection
+from lexsplat.runtime.files import read_tensors
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.facts import NO_SEGMENTS, scene_facts
-from lexsplat.scenes.folder import SceneFolder
+from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.records import read_record
 
 OLD = Path(__file__).parents[1] / "data" / "scene_d4e65b3"
@@ -114,3 +117,27 @@ def test_an_old_journal_is_replayed(tmp_path):
     again = Editor(scene, journal)
     assert torch.equal(again.scene.gaussians.sh0, editor.scene.gaussians.sh0)
     assert [step.kind for step in again.steps] == ["recolor"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("masses", torch.zeros(39998).half(), "masses must be finite, and some of them positive"),
+        ("labels", torch.zeros(39998), "segments.labels must be integers"),
+        ("levels", torch.tensor([[0, 0, 1], [0, 1, 1]]), "levels must be nested"),
+    ],
+)
+def test_segments_made_by_hand_without_a_checksum_are_refused_in_one_line(
+    tmp_path, capsys, name, value, told
+):
+    scene = shutil.copytree(BUNDLED_SCENE, tmp_path / "scene")
+    tensors, metadata = read_tensors(scene / "language.safetensors")
+    earlier = {
+        "labels": torch.zeros(39998, dtype=torch.uint16),
+        "masses": torch.ones(39998).half(),
+        "levels": torch.zeros(1, 3, dtype=torch.int32),
+    }
+    by_hand = {key: tensor for key, tensor in tensors.items() if not key.startswith("segments.")}
+    by_hand |= {f"segments.{key}": tensor for key, tensor in (earlier | {name: value}).items()}
+    save_file(by_hand, scene / "language.safetensors", metadata)
+    fails_in_one_line(capsys, ["list", str(scene)], "language.safetensors", told)

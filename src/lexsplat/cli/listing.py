@@ -91,13 +91,20 @@ def _print_objects(document: dict[str, Any]) -> None:
 
 
 def _print_table(things: list[dict[str, Any]]) -> None:
+    from lexsplat.queries.places import angle_of_box
+
     columns = ("center", "size", "size_meters", "center_meters")
     writer = csv.writer(sys.stdout, lineterminator="\n")
     places = [f"{column}_{axis}" for column in columns for axis in "xyz"]
-    writer.writerow(["name", "probability", "colors", *places, "gaussians", "best_view"])
+    last = ["gaussians", "best_view", "names", "probabilities", "box_angle_degrees"]
+    writer.writerow(["name", "probability", "colors", *places, *last])
     for thing in things:
-        probability, colors = thing["names"][0]["probability"], " ".join(thing["colors"])
+        names, shares = ([each[key] for each in thing["names"]] for key in ("name", "probability"))
         numbers = [value for column in columns for value in thing.get(column, [""] * 3)]
         writer.writerow(
-            [thing["name"], probability, colors, *numbers, thing["gaussians"], thing["best_view"]]
+            [
+                *(thing["name"], shares[0], " ".join(thing["colors"]), *numbers),
+                *(thing["gaussians"], thing["best_view"]),
+                *(";".join(names), ";".join(map(str, shares)), angle_of_box(thing["axes"])),
+            ]
         )

@@ -13,8 +13,10 @@ All distances are relative to their mean in the scene, so nothing depends on how
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -49,7 +51,7 @@ _PREFIX = "segments."
 _MOSTLY = 0.5
 """Share of a segment's visible weight, of which a copy is one of the segment."""
 _ADDED = 2
-"""In the tensor "hidden", the Gaussians of fills."""
+"""In the tensor "hidden" of earlier versions, the Gaussians of fills."""
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -84,8 +86,7 @@ class Segments:
         if self.labels.numel() and not self.levels.numel():
             raise ValueError("segments of Gaussians need a level")
         for name, values in (("labels", self.labels), ("levels", self.levels)):
-            if values.numel() and not 0 <= int(values.min()) <= int(values.max()) < self.levels.shape[1]:
-                raise ValueError(f"{name} must be in 0..{self.levels.shape[1] - 1}")
+            _check_range(name, values, self.levels.shape[1])
         if self.masses.numel() and float(self.masses.min()) < 0:
             raise ValueError("masses must not be negative")
         for name, mask in (("hidden", self.hidden), ("added", self.added)):
@@ -130,40 +131,109 @@ class Segments:
         return Segments(labels, both.masses, torch.stack(levels), both.hidden, both.added)
 
     def tensors(self) -> dict[str, Tensor]:
-        """For safetensors: 4 bytes a Gaussian if there are at most 65,536 segments."""
-        small = self.levels.shape[1] <= 1 << 16
+        """For safetensors, without loss but for masses, which are rounded to 16 bits.
+
+        A Gaussian has a bit for each binary digit of the largest label, and 16 for its mass; after an edit also one
+        for "hidden", and one for "added". Of the levels, each segment has its segment at the next one in 2 bytes.
+        """
+        lowest, parts = self.levels.shape[1], [self.levels.new_zeros(0)]
+        below, counts = torch.arange(lowest, device=self.levels.device), [lowest]
+        for level in self.levels:
+            parts.append(level.new_zeros(counts[-1]).scatter_(0, below, level))
+            below, counts = level, [*counts, int(level.max()) + 1 if lowest else 0]
+        digits = max(1, int(self.labels.max() if len(self.labels) else 0).bit_length())
         found = {
-            _PREFIX + "labels": self.labels.to(torch.uint16 if small else torch.int32),
-            _PREFIX + "masses": self.masses.clamp(max=6e4).half(),
-            _PREFIX + "levels": self.levels.to(torch.int32),
+            "label_bits": torch.stack([_packed(self.labels >> digit & 1) for digit in range(digits)]),
+            "masses": self.masses.clamp(max=6e4).half(),
+            "parents": torch.cat(parts).to(torch.uint16 if lowest <= 1 << 16 else torch.int32),
+            "counts": torch.tensor(counts),
         }
-        if self.hidden is not None:
-            found[_PREFIX + "hidden"] = self.hidden.to(torch.uint8)
-            if self.added is not None:
-                found[_PREFIX + "hidden"] += self.added
-        return found
+        masks = {"hidden_bits": self.hidden, "added_bits": self.added if self.hidden is not None else None}
+        found |= {name: _packed(mask) for name, mask in masks.items() if mask is not None}
+        return {_PREFIX + name: value for name, value in found.items()}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Segments | None:
-        """The inverse of `tensors`; None if there are no segments among them.
+        """The inverse of `tensors`, also of those of earlier versions; None if there are no segments among them.
 
         Raises:
-            ValueError: If one of the tensors is missing, or they do not fit each other.
+            ValueError: If one of the tensors is missing, is of the wrong kind, or they do not fit each other.
         """
-        names = ("labels", "masses", "levels")
-        found = {name: tensors[_PREFIX + name] for name in names if _PREFIX + name in tensors}
+        found = {name.removeprefix(_PREFIX): tensors[name] for name in tensors if name.startswith(_PREFIX)}
         if not found:
             return None
-        if len(found) < len(names):
-            raise ValueError(f"segments lack {', '.join(name for name in names if name not in found)}")
-        hidden = tensors.get(_PREFIX + "hidden")
-        return cls(
-            found["labels"].long(),
-            found["masses"].float(),
-            found["levels"].long(),
-            None if hidden is None else hidden.bool(),
-            None if hidden is None or not bool((hidden == _ADDED).any()) else hidden == _ADDED,
-        )
+        earlier = not found.keys() & {"label_bits", "parents", "counts"}
+        names = ("labels", "masses", "levels") if earlier else ("label_bits", "masses", "parents", "counts")
+        if missing := [name for name in names if name not in found]:
+            raise ValueError(f"segments lack {', '.join(missing)}")
+        for name, tensor in found.items():
+            if (tensor.is_floating_point() or tensor.is_complex()) != (name == "masses"):
+                kind = "floats" if name == "masses" else "integers"
+                raise ValueError(f"{_PREFIX}{name} must be {kind}, got {tensor.dtype}")
+        masses = found["masses"].float()
+        if masses.numel() and not 0 < float(masses.double().sum()) < math.inf:
+            raise ValueError("masses must be finite, and some of them positive")
+        if masses.ndim != 1 or (not earlier and found["label_bits"].ndim != 2):
+            raise ValueError("masses [N] and label_bits [B, N / 8] expected")
+        if earlier:
+            read = _of_earlier_version(found)
+        else:
+            labels = torch.zeros_like(masses, dtype=torch.int64)
+            for digit, bits in enumerate(found["label_bits"]):
+                labels |= _unpacked(bits, masses).long() << digit
+            masks = (found.get(name) for name in ("hidden_bits", "added_bits"))
+            hidden, added = (None if bits is None else _unpacked(bits, masses) for bits in masks)
+            read = (labels, _levels(found["parents"].long(), found["counts"].long()), hidden, added)
+        return cls(read[0], masses, *read[1:])
+
+
+_Read = tuple[Tensor, Tensor, Tensor | None, Tensor | None]
+"""Labels, levels, and the masks "hidden" and "added"."""
+
+
+def _of_earlier_version(found: Mapping[str, Tensor]) -> _Read:
+    """What earlier versions stored as ``labels [N]``, ``levels [L, S]`` and ``hidden [N]``, where 2 means added."""
+    levels, hidden = found["levels"].long(), found.get("hidden")
+    if levels.ndim == 2:
+        for below, level in pairwise(levels):
+            _check_range("levels", below, levels.shape[1])
+            parents = torch.zeros_like(below).scatter_(0, below, level)
+            if not torch.equal(parents[below], level):
+                raise ValueError("levels must be nested: a segment lies in one segment of the next level")
+    if hidden is None:
+        return found["labels"].long(), levels, None, None
+    added = hidden == _ADDED
+    return found["labels"].long(), levels, hidden.bool(), added if bool(added.any()) else None
+
+
+def _levels(parents: Tensor, counts: Tensor) -> Tensor:
+    """The levels ``[L, S]`` from the segment of each segment at the next level, and the numbers of segments."""
+    sizes = counts.tolist() if counts.ndim == 1 else []
+    if not sizes or min(sizes) < 0 or parents.ndim != 1 or sum(sizes[:-1]) != len(parents):
+        raise ValueError(f"parents of {sizes[:-1]} segments expected, got {list(parents.shape)}")
+    levels: list[Tensor] = []
+    for part, count in zip(parents.split(sizes[:-1]), sizes[1:]):
+        _check_range("parents", part, count)
+        levels.append(part[levels[-1]] if levels else part)
+    return torch.stack(levels) if levels else parents.new_zeros(0, sizes[0])
+
+
+def _check_range(name: str, values: Tensor, count: int) -> None:
+    if values.numel() and not 0 <= int(values.min()) <= int(values.max()) < count:
+        raise ValueError(f"{name} must be in 0..{count - 1}")
+
+
+def _packed(mask: Tensor) -> Tensor:
+    """Bits ``[N]``, eight in a byte, the first one the highest."""
+    return torch.from_numpy(np.packbits(mask.cpu().numpy().astype(np.uint8))).to(mask.device)
+
+
+def _unpacked(packed: Tensor, like: Tensor) -> Tensor:
+    """The inverse of `_packed` as bool, as many as another tensor ``[N]`` has and on its device."""
+    count = len(like)
+    if packed.dtype != torch.uint8 or packed.shape != ((count + 7) // 8,):
+        raise ValueError(f"bits of {count} Gaussians expected, got {packed.dtype} {list(packed.shape)}")
+    return torch.from_numpy(np.unpackbits(packed.cpu().numpy(), count=count).astype(bool)).to(like.device)
 
 
 Rows = Callable[[slice | Tensor], Tensor]

@@ -33,6 +33,11 @@ NEAR = (
 """Pairs of colors of which one may be seen as the other in another light."""
 SEEN = 0.1
 """A thing is seen in a color that has this share of its visible weight."""
+METALS = {
+    "gold": "yellow orange brown", "golden": "yellow orange brown",
+    "silver": "gray white", "copper": "orange brown red",
+}  # fmt: skip
+"""The colors in which things of a metal are seen. So are other things: a yellow ring may be of wood."""
 _ARTICLES = frozenset({"a", "an", "the", "my", "your"})
 _LEAST = 0.2
 """A word stands for at least this share of the visible weight, except for the first word."""
@@ -71,6 +76,12 @@ def color_told(phrase: str) -> set[str]:
     """The colors that a phrase tells of a thing: "red" of "red mug", but not that of an orange."""
     before = phrase.lower().replace("grey", "gray").split()[:-1]
     return set(before) & set(COLOR_WORDS)
+
+
+def colors_expected(phrase: str) -> set[str]:
+    """The colors of which a thing shows one if a phrase is right: those that it tells, and those of its metals."""
+    before = phrase.lower().split()[:-1]
+    return color_told(phrase).union(*(METALS.get(word, "").split() for word in before))
 
 
 def without_color(phrase: str) -> str:

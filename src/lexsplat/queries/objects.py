@@ -27,6 +27,8 @@ _WHOLE = 0.75
 """A name describes a segment as a whole if it describes this share of what the views show of it."""
 _SLOPE = 12.0
 """Slope of the log-odds of a name over its strength."""
+_NEARLY = 0.5
+"""A name is nearly the likeliest if it has this share of that one's probability."""
 _WORDS = 256
 
 FloatArray = NDArray[np.float64]
@@ -41,10 +43,12 @@ class WholeSegments(NamedTuple):
     Args:
         places: The one that holds each lowest segment ``[S]``, in 0..V-1; -1 where no word describes any.
         words: The word that describes each segment best ``[V]``.
+        strengths: How well it does ``[V]``.
     """
 
     places: IntArray
     words: IntArray
+    strengths: FloatArray
 
 
 def whole_segments(
@@ -82,7 +86,42 @@ def whole_segments(
         described = np.bincount(level, codes.masses[lowest] * (at_parts >= _PART), len(codes.masses))
         whole = (most[level] >= FITS) & (described[level] >= _WHOLE * codes.masses[level])
         places = np.where((places < 0) & whole, level, places)
-    return WholeSegments(places, best)
+    return WholeSegments(places, best, most)
+
+
+def with_surfaces(
+    whole: WholeSegments, masses: FloatArray, surfaces: IntArray, strengths: FloatArray
+) -> WholeSegments:
+    """The same segments, where surfaces have their names, and near-synonyms are one name.
+
+    A floor that few views show resembles many words. So a segment has the name of a surface if that is nearly the
+    likeliest, and describes it nearly as well as anything: "table" is a name for the table, not for the ring on it.
+    Two names of surfaces are one, that of most of what the views show, if each is nearly the likeliest at three
+    quarters of what has the other: a table in four pieces is no "table" and three "desks".
+
+    Args:
+        whole: The objects.
+        masses: Visible weights of all segments ``[V]``.
+        surfaces: The words that name surfaces ``[F]``.
+        strengths: How well they describe each segment ``[V, F]``.
+    """
+    held = np.unique(whole.places[whole.places >= 0])
+    if not len(held):
+        return whole
+    here, shown, words = strengths[held], masses[held], whole.words.copy()
+    less = -np.log(_NEARLY) / _SLOPE
+    nearly = here >= whole.strengths[held, None] - less
+    fits = nearly & (here >= here.max(0) - less)
+    named = fits.any(1) & ~np.isin(words[held], surfaces)
+    words[held[named]] = surfaces[np.where(fits, here, -np.inf).argmax(1)[named]]
+    own = words[held][:, None] == surfaces
+    sums = shown @ own
+    alike = (own * shown[:, None]).T @ nearly >= _WHOLE * sums[:, None]
+    alike &= alike.T & (sums > 0) & (sums[:, None] > 0)
+    for place in np.argsort(sums, kind="stable"):
+        largest = max(np.flatnonzero(alike[place]), key=lambda other: sums[other], default=place)
+        words[words == surfaces[place]] = surfaces[largest]
+    return whole._replace(words=words)
 
 
 def pieces_of_others(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lexsplat.geometry.world import World
 from lexsplat.runtime.errors import QueryError
@@ -53,6 +56,22 @@ def lengths(
         f"{name}_meters": _rounded(v * meters_per_unit for v in values) for name, values in known.items()
     }
     return {**units, **meters}
+
+
+def angle_of_box(axes: Sequence[Sequence[float]] | NDArray[np.float64]) -> float:
+    """How far an upright box is turned about the vertical, in degrees with one decimal, at least 0 and below 180.
+
+    It is the angle from the scene's x axis to the first axis of the box, counterclockwise as seen from above. Where x
+    is within 45 degrees of the vertical, the scene's y axis takes its place.
+
+    Args:
+        axes: The axes of the box as rows ``[3, 3]``, the last one up (`lexsplat.geometry.boxes.Box`).
+    """
+    rows = np.asarray(axes, dtype=np.float64)
+    up = rows[2]
+    start = np.eye(3)[0 if up[0] ** 2 <= 0.5 else 1]
+    across, along = np.cross(up, start) @ rows[0], start @ rows[0]
+    return round(float(np.degrees(np.arctan2(across, along))) % 180.0, 1) % 180.0
 
 
 def given_length(world: World | None, distance: float | None, meters: float | None) -> float | None:

@@ -118,17 +118,20 @@ class Seen:
         mass = np.bincount(inverse, self._masses[found], len(labels))
         return labels, mass / np.maximum(self._totals[labels], 1e-12)
 
-    def shares(self, indices: Tensor, promising: Sequence[str] | None) -> list[tuple[str, float]]:
+    def shares(
+        self, indices: Tensor, promising: Sequence[str] | None, most: int = _BEST
+    ) -> list[tuple[str, float]]:
         """The views that show most of some Gaussians and the share of the image they cover there; best first.
 
         Args:
             indices: The Gaussians ``[M]``.
             promising: The views to look at; None looks at all, which `complete` makes cheap.
+            most: The number of views that are told, at most.
         """
         labels, taken = self._taken(indices)
         names = self._names if promising is None else [name for name in promising if name in self._cameras]
         shares = taken @ self._shares[labels] if promising is None else self._at(names, labels, taken)
-        order = np.argsort(-shares, kind="stable")[:_BEST]
+        order = np.argsort(-shares, kind="stable")[:most]
         return [(names[place], float(shares[place])) for place in order]
 
     @cached_property

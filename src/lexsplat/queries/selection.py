@@ -23,7 +23,7 @@ from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.rotations import matrices_from_quaternions
 from lexsplat.geometry.world import World
-from lexsplat.queries.best_views import promising_views, visible_share
+from lexsplat.queries.best_views import best_of, promising_views, visible_share
 from lexsplat.queries.clusters import LINK, clusters, spacing
 from lexsplat.queries.pieces import with_pieces
 from lexsplat.queries.places import given_length, place_of
@@ -222,8 +222,8 @@ class Selection:
 
     @cached_property
     def best_view(self) -> str:
-        """Name of the view in which it covers most pixels; "" if there are no views or nothing is selected."""
-        return self.view_shares[0][0] if self.view_shares else ""
+        """Name of the view that shows most of it, or nearly as much and the whole of it; "" if there is none."""
+        return best_of(self)
 
     @cached_property
     def view_shares(self) -> list[tuple[str, float]]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from lexsplat.queries.colors import color_told, unqualified, without_color
+from lexsplat.queries.colors import colors_expected, unqualified, without_color
 from lexsplat.queries.parts import HELD
 from lexsplat.queries.phrases import Except, Phrase, Thing, parts_of
 from lexsplat.queries.selection import Selection
@@ -72,13 +72,13 @@ def doubt(scene: Scene, phrase: str, taken: Tensor) -> str:
         return ""
     named, places = listed_as(scene, phrase), mainly(scene, taken)
     others = [each for each in places if each not in named]
-    told = color_told(phrase)
+    expected = colors_expected(phrase)
     notes = []
     if others:
         names = _and(described(scene, each) for each in others)
         notes.append(f'what best fits "{phrase[:60]}" is listed as {names}')
-    for each in named if told else ():
-        if not told & set(object_colors(scene, each)[:1]):
+    for each in named if expected else ():
+        if not expected & set(object_colors(scene, each)[:1]):
             notes.append(f"the {each.phrase} is mainly {object_colors(scene, each)[0]}")
     return "; ".join(dict.fromkeys(notes))
 

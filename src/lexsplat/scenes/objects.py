@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,17 +11,26 @@ import torch
 from scipy.spatial import cKDTree
 
 from lexsplat.queries.objects import (
+    WholeSegments,
     likeliest_things,
     name_probabilities,
     pieces_of_others,
     whole_segments,
+    with_surfaces,
 )
 from lexsplat.queries.pieces import level_with
 from lexsplat.queries.presence import FAINT
 from lexsplat.queries.relations import same
 from lexsplat.queries.relevancy import check_prompts
 from lexsplat.queries.selection import SMALLEST_SHARE, Selection
-from lexsplat.queries.vocabulary import CARRIERS, STUFF, SURFACES, default_vocabulary, gives_way
+from lexsplat.queries.vocabulary import (
+    CARRIERS,
+    STUFF,
+    SURFACES,
+    default_vocabulary,
+    gives_way,
+    is_divided,
+)
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.progress import Event
 from lexsplat.scenes.answers import find_best_views, rests_on
@@ -31,6 +40,7 @@ from lexsplat.scenes.sheet import write_sheet
 from lexsplat.scenes.underfoot import underfoot
 
 if TYPE_CHECKING:
+    from lexsplat.language.segment_codes import SegmentCodes
     from lexsplat.scenes.scene import Scene
 
 MAX_WORDS = 2000
@@ -48,7 +58,7 @@ _FAR_BETTER = 0.5
 
 
 def read_vocabulary(path: Path) -> list[str]:
-    """The phrases of a text file, one a line; empty lines and lines that start with # are skipped.
+    """The phrases of a text file, one a line, each once; empty lines and lines that start with # are skipped.
 
     Raises:
         FileFormatError: If the file cannot be read, is not text, is too large or has no phrase.
@@ -72,7 +82,7 @@ def read_vocabulary(path: Path) -> list[str]:
     except UnicodeDecodeError as error:
         raise refused("text in UTF-8", f"other bytes at {error.start}") from error
     lines = (" ".join(line.split()) for line in text.splitlines())
-    phrases = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
+    phrases = distinct_names(line for line in lines if line and not line.startswith("#"))
     if not phrases:
         raise refused("at least one name", "none")
     for line in phrases:
@@ -86,12 +96,21 @@ def read_vocabulary(path: Path) -> list[str]:
     return phrases
 
 
+def distinct_names(names: Iterable[str]) -> list[str]:
+    """Names without those that differ from an earlier one only by case or by spaces."""
+    found: dict[str, str] = {}
+    for name in names:
+        found.setdefault(" ".join(name.casefold().split()), name)
+    return list(found.values())
+
+
 def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection, ...]:
     """The objects of a scene, those that the views show most of first.
 
     Args:
         scene: The scene.
-        vocabulary: Candidate names of the objects; () takes the everyday names of `lexsplat.queries.vocabulary`.
+        vocabulary: Candidate names of the objects, in any case; () takes the everyday names of
+            `lexsplat.queries.vocabulary`.
 
     The listener of the scene receives events of stage "objects", one for each name.
 
@@ -101,18 +120,14 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     Raises:
         QueryError: If a phrase is empty.
     """
-    words = check_prompts(list(vocabulary) or default_vocabulary(scene.clip))
+    words = distinct_names(check_prompts(list(vocabulary) or default_vocabulary(scene.clip)))
     if scene.field.segments is None:
         return _named_by_words(scene, words)
     classifier, segments, texts = scene.presence_classifier, scene.field.segments, scene.embed(words)
     codes = classifier.segment_codes
     if codes is None:
         return ()
-    whole = whole_segments(
-        codes,
-        lambda part: classifier.strengths(texts[part], codes.distributions),
-        [gives_way(word) for word in words],
-    )
+    whole = _whole_segments(scene, words, texts, codes)
     numbers = np.where(whole.places < 0, -1, whole.words[whole.places])
     known = np.unique(numbers[numbers >= 0])
     if len(known) == 0:
@@ -149,6 +164,23 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     return tuple(sorted(found, key=lambda each: -float(segments.masses[each.indices].sum())))
 
 
+def _whole_segments(
+    scene: Scene, words: Sequence[str], texts: torch.Tensor, codes: SegmentCodes
+) -> WholeSegments:
+    """The segments that are objects, by words with embeddings ``[W, D]``; surfaces have their names."""
+    classifier = scene.presence_classifier
+    whole = whole_segments(
+        codes,
+        lambda part: classifier.strengths(texts[part], codes.distributions),
+        [gives_way(word) for word in words],
+    )
+    surfaces = np.flatnonzero([word.lower() in STUFF or is_divided(word) for word in words])
+    if not len(surfaces):
+        return whole
+    strengths = classifier.strengths(texts[surfaces], codes.distributions)
+    return with_surfaces(whole, codes.masses, surfaces, strengths)
+
+
 def _with_pieces_apart(
     scene: Scene, surface: torch.Tensor, pieces: torch.Tensor, things: torch.Tensor
 ) -> torch.Tensor:
@@ -164,7 +196,7 @@ def _with_pieces_apart(
     """
     if not bool((surface & (things >= 0)).any()):
         return pieces
-    chosen = scene.selection(surface, torch.zeros(len(surface), device=surface.device))
+    chosen = scene.selection(surface, scene.gaussians.opacities.detach())
     labels, weights = chosen._clusters()
     like = things[chosen.indices].cpu().numpy()
     opacities = scene.gaussians.opacities[chosen.indices].detach().cpu().double().numpy()
@@ -239,7 +271,7 @@ def list_document(
         "scene": str(scene.folder.root) if scene.folder else None,
         "rests_on": rests_on(scene),
         **scene.world.to_json(),
-        "words": len(vocabulary) or len(default_vocabulary(scene.clip)),
+        "words": len(distinct_names(vocabulary)) or len(default_vocabulary(scene.clip)),
         "note": "" if scene.field.segments else f"no segments: each word is looked for; {NO_SEGMENTS}",
         "picture": None if picture is None else str(picture),
         "objects": [_entry(scene, thing) for thing in things],

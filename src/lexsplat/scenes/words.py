@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lexsplat.queries.colors import color_told, is_qualified, may_be
+from lexsplat.queries.colors import color_told, colors_expected, is_qualified, may_be
 from lexsplat.queries.kinds import is_kind, is_of_kind
 from lexsplat.queries.part_names import DOUBTFUL, is_doubtful
 from lexsplat.queries.parts import FEWEST, ThingGraph, part_scores, with_parts
@@ -239,10 +239,10 @@ def of_qualities(scene: Scene, prompt: str, word: Word) -> Word:
 
     Encoders take a thing for the same thing in another color, or another thing for it: a banana for a yellow apple,
     in a scene with a red one. Such a word is "unsure". They also keep the color that a thing had before it was
-    recolored. An object that the prompt without its color names, and whose pixels have mostly the color, is the
-    answer, whatever they say.
+    recolored, also that of a metal: a blue ring is no "gold ring". An object that the prompt without its color names,
+    and whose pixels have mostly the color, is the answer, whatever they say.
     """
-    told = color_told(prompt)
+    told, expected = color_told(prompt), colors_expected(prompt)
     if not is_qualified(prompt) or form_used(scene.field, scene.query) != "segment":
         return word
     if not scene.field.segments:
@@ -251,7 +251,7 @@ def of_qualities(scene: Scene, prompt: str, word: Word) -> Word:
         taken = (word.scores >= BORDER) & ~scene.hidden
         held, name = holding(scene, taken), prompt.lower().split()[-1]
         other = held and name in _last_words(scene.objects) - _last_words(held)
-        if not other and (not told or not held or _is_seen_in(scene, held, told, taken)):
+        if not other and (not expected or not held or _is_seen_in(scene, held, expected, taken)):
             return word
         word = replace(word, presence="unsure")
     return _of_members(word, of_color_told(scene, prompt, told)) if told else word
@@ -263,12 +263,12 @@ def of_color_told(scene: Scene, prompt: str, told: set[str]) -> list[Selection]:
     return [each for each in named if object_colors(scene, each)[0] in told]
 
 
-def _is_seen_in(scene: Scene, things: Sequence[Selection], told: set[str], taken: Tensor) -> bool:
+def _is_seen_in(scene: Scene, things: Sequence[Selection], expected: set[str], taken: Tensor) -> bool:
     """Whether things are seen in a color or a near one, and not only a part of them: a bear with a light belly."""
-    if not may_be(told, {color for each in things for color in seen_colors(scene, each)}):
+    if not may_be(expected, {color for each in things for color in seen_colors(scene, each)}):
         return False
     return any(
-        2 * int(taken[each.indices].sum()) > len(each) or told & set(object_colors(scene, each))
+        2 * int(taken[each.indices].sum()) > len(each) or expected & set(object_colors(scene, each))
         for each in things
     )
 

@@ -28,7 +28,7 @@ from lexsplat.geometry.world import World
 from lexsplat.language.segment_codes import SegmentCodes, segment_codes
 from lexsplat.language.segments import Segments
 from lexsplat.queries.clusters import LINK
-from lexsplat.queries.colors import color_told, may_be
+from lexsplat.queries.colors import color_told, colors_expected, may_be
 from lexsplat.queries.everyday import EverydayScale
 from lexsplat.queries.grammar import understand
 from lexsplat.queries.kinds import is_kind, is_of_kind, words_of_things
@@ -159,16 +159,16 @@ def answer_from(contents: Contents, codes: Tensor, thing: Thing, phrase: str, te
     classifier, unit, words = _KeptPresence(contents, codes), text[None].float(), thing.text.lower().split()
     (presence,) = classifier.classify([thing.text], unit, torch.zeros(1, 1))
     presence = "no" if noun_of(thing.text) in contents.facts.get("gone", ()) else presence
-    told = color_told(thing.text)
+    told, expected = color_told(thing.text), colors_expected(thing.text)
     if presence != "yes" and told and any(told & colors for colors in _colors_of(contents, words[-1])):
         return None  # an object of this name that is mostly in this color is the answer
     if presence == "no":
         return Indexed({**_answer([], presence), **common}, contents)
-    if presence == "yes" and told:
+    if presence == "yes" and expected:
         seen = _colors_of(contents, words[-1])
         if not seen:
             return None
-        presence = "yes" if any(may_be(told, colors) for colors in seen) else "unsure"
+        presence = "yes" if any(may_be(expected, colors) for colors in seen) else "unsure"
     best = classifier.best_heights([thing.text])
     by_code = classifier.scale.relevancy(classifier.language.codebook.clip, unit, best)[:, 0].numpy()
     own = torch.from_numpy(np.clip(_spread(contents) @ by_code, 0, 1))[None]
@@ -182,17 +182,18 @@ def answer_from(contents: Contents, codes: Tensor, thing: Thing, phrase: str, te
         return Indexed({**_answer([], "no"), **common}, contents)
     parts = [taken] if words[-1] in STUFF else _instances(contents, taken, own[0].numpy())
     found = [_instance(contents, part, scores, thing.text) for part in parts]
-    if not found or (told and not any(_is_in_color(contents, each[0], words[-1], told) for each in found)):
+    in_color = (_is_in_color(contents, each[0], words[-1], expected) for each in found)
+    if not found or (expected and not any(in_color)):
         return None
     return Indexed({**_answer([each[0] for each in found], presence), **common}, contents, *found[0][1:])
 
 
-def _is_in_color(contents: Contents, instance: Mapping[str, Any], name: str, told: set[str]) -> bool:
+def _is_in_color(contents: Contents, instance: Mapping[str, Any], name: str, expected: set[str]) -> bool:
     """Whether an instance lies in an object of a name that is seen in a color, or in a near one."""
     for each, colors in zip(contents.facts["objects"], contents.facts.get("colors", ())):
         place = np.array(each["axes"]) @ (np.array(instance["center"]) - each["center"])
         inside = bool((np.abs(place) <= np.array(each["size"]) / 2).all())
-        if inside and each["name"].split()[-1] == name and may_be(told, set(colors)):
+        if inside and each["name"].split()[-1] == name and may_be(expected, set(colors)):
             return True
     return False
 
