@@ -28,6 +28,8 @@ export class Geometry {
   readonly lights: Float32Array;
   /** Which splats no photo shows, as in `Segments`; null where that is not known. */
   hidden: Uint8Array | null = null;
+  /** The listed object of each splat, a number without a size for none, and how many splats each object has. */
+  listed: { of: Uint8Array; sizes: number[] } | null = null;
   readonly #scales: Float32Array;
   readonly #quats: Float32Array;
 
@@ -127,13 +129,14 @@ export class Geometry {
 
   /**
    * The places that a threshold selects, the surest first: connected cells of a grid, without specks and without
-   * clusters of which these scores are far worse than those of the best one; null compares none.
+   * clusters of which these scores are far worse than those of the best one; null compares none. Clusters of one listed
+   * object are one place: a lamp and its stand.
    */
   places(scores: Float32Array, threshold: number, compared: Float32Array | null = scores): Place[] {
     const chosen: number[] = [];
     for (let i = 0; i < this.count; i++) if (scores[i] >= threshold) chosen.push(i);
     if (chosen.length === 0) return [];
-    const clusters = this.#clusters(chosen).map((splats) => ({
+    const clusters = this.#united(this.#clusters(chosen)).map((splats) => ({
       splats,
       mass: splats.reduce((sum, i) => sum + this.opacities[i], 0),
       peak: this.#peak(scores, splats),
@@ -147,6 +150,34 @@ export class Geometry {
       .filter((_, n) => !compared || odds(heights[n]) >= limit)
       .sort((a, b) => b.peak * Math.sqrt(b.mass) - a.peak * Math.sqrt(a.mass))
       .map(({ splats }) => this.place(splats));
+  }
+
+  /** Clusters, of which those of one listed object are one if they hold most of it: two wheels of a car are two. */
+  #united(clusters: number[][]): number[][] {
+    const { listed } = this;
+    if (!listed || clusters.length < 2) return clusters;
+    const own = clusters.map((cluster) => {
+      const counts = listed.sizes.map(() => 0);
+      for (const i of cluster) if (listed.of[i] < counts.length) counts[listed.of[i]]++;
+      const most = counts.indexOf(Math.max(0, ...counts));
+      return 2 * (counts[most] ?? 0) > cluster.length ? { object: most, count: counts[most] } : null;
+    });
+    const held = listed.sizes.map((_, object) => own.reduce((sum, each) => sum + (each?.object === object ? each.count : 0), 0));
+    const places = new Map<number, number[]>();
+    const found: number[][] = [];
+    clusters.forEach((cluster, n) => {
+      const object = own[n]?.object;
+      const whole = object !== undefined && 2 * held[object] > listed.sizes[object];
+      const place = whole ? places.get(object) : undefined;
+      if (place) {
+        for (const i of cluster) place.push(i);
+        return;
+      }
+      const kept = [...cluster];
+      if (whole) places.set(object, kept);
+      found.push(kept);
+    });
+    return found;
   }
 
   #peak(scores: Float32Array, splats: number[]): number {

@@ -9,6 +9,8 @@ import { type ObjectEntry, PageError } from "./manifest";
 const MEMBER = 0.9;
 /** Share of an object of its name from which a word is that object, as there. */
 const PIECE = 0.3;
+/** Share of an object of its noun from which a phrase with a quality is that object, as there. */
+const MOSTLY = 0.7;
 
 export class Kinds {
   readonly #members: ReadonlyMap<string, number[]>;
@@ -24,6 +26,9 @@ export class Kinds {
     }
     this.#members = new Map(Object.entries(members));
     this.#objects = objects;
+    const sizes = objects.map(() => 0);
+    for (const place of content) if (place < sizes.length) sizes[place]++;
+    geometry.listed = { of: content, sizes };
   }
 
   get names(): string[] {
@@ -79,6 +84,14 @@ export class Kinds {
       for (const i of splats) if (isTaken.has(i)) result[i] = Math.min(result[i], border);
     });
     return result;
+  }
+
+  /** Whether some splats are nearly all of an object. */
+  isMostly(place: number, taken: number[]): boolean {
+    this.#places ??= this.#found();
+    const isTaken = new Set(taken);
+    const { splats } = this.#places[place];
+    return splats.filter((i) => isTaken.has(i)).length >= MOSTLY * splats.length;
   }
 
   /** The places of the objects of which some splats are at least half. */

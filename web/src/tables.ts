@@ -242,9 +242,11 @@ export class Tables implements Source {
       const noun = phrase.toLowerCase().split(" of ")[0].split(" ").at(-1)!;
       const named = this.kinds.named(singulars(noun)).filter((place) => {
         const { name } = this.kinds.entry(place);
-        return !grammar.has("stuff", name) && (name === phrase.toLowerCase() || !this.#isQualified(phrase));
+        if (grammar.has("stuff", name)) return false;
+        return name === phrase.toLowerCase() || !this.#isQualified(phrase) || this.kinds.isMostly(place, splats);
       });
-      scores = this.kinds.completed(scores, splats, named, (name) => grammar.has("surfaces", name));
+      const isSurface = (name: string): boolean => grammar.has("surfaces", name) && !grammar.has("carriers", name);
+      scores = this.kinds.completed(scores, splats, named, isSurface);
     }
     return { scores, own, ...parts, presence: presence === "yes" && !sure ? ("unsure" as const) : presence, threshold };
   }

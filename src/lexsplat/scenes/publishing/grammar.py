@@ -9,7 +9,7 @@ from lexsplat.queries import having, leftovers, patterns, questions
 from lexsplat.queries.colors import COLOR_WORDS, NEAR
 from lexsplat.queries.kinds import KIND_PHRASES
 from lexsplat.queries.meaning import known_words
-from lexsplat.queries.vocabulary import COLORS, NAMES, QUALITIES, STUFF, SURFACES
+from lexsplat.queries.vocabulary import CARRIERS, COLORS, NAMES, QUALITIES, STUFF, SURFACES
 
 _OF_THE_GRAMMAR = (
     "RELATION", "BETWEEN", "CORNER", "PART", "ASIDE", "NEAR_ME", "MY_SIDE", "DETERMINER", "THE_ONE", "EXCEPT", "NOT",
@@ -50,6 +50,7 @@ def page_grammar(clip: str = "") -> dict[str, Any]:
             "kinds": list(KIND_PHRASES),
             "names": sorted(NAMES),
             "surfaces": sorted(SURFACES),
+            "carriers": sorted(CARRIERS),
             "stuff": sorted(STUFF),
             "in_compounds": sorted(known_words(clip)),
         },
