@@ -116,6 +116,7 @@ def pickled(folder: Path, content: bytes | dict) -> Path:
         (b"\x80\x02" + b"\xff" * 50, "a damaged file"),
         (b"hello world", "a damaged file"),
         (b"PK\x03\x04" + b"x" * 90, "a damaged file"),
+        (b"cposix\nsystem\n(S'true'\ntR.", "other objects"),
         (b"", "an empty file"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 598641023\n", "a pointer of Git LFS"),
         ({"weight": Path("a")}, "other objects"),

@@ -242,6 +242,26 @@ def test_features_of_another_depth_are_reported_before_the_reconstruction(
         build_refused((tiny_capture,), tmp_path / "scene", config, *told, kind=FileFormatError)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_features_with_one_number_that_is_not_finite_are_reported_before_the_cameras_of_photos(
+    tiny_capture, tmp_path, monkeypatch, value
+):
+    for place in ("pipeline.geometry.reconstruct", "pipeline.inputs.poses_from_photos"):
+        monkeypatch.setattr(f"lexsplat.{place}", lambda *_, **__: pytest.fail("too late"))
+    folder = tmp_path / "arrays"
+    folder.mkdir()
+    for name in load_capture(tiny_capture).views:
+        array = np.ones((72, 96, 128), np.float32)
+        array[70, 3, 5] = value if name.startswith("view_03") else 1
+        np.save(folder / f"{Path(name).stem}.npy", array)
+    config = BuildConfig(clip="bundled", dino="none", device="cpu", iterations=2, features_from=folder)
+    told = ["view_03.npy", "expected finite numbers", "NaN or infinity"]
+    build_refused(
+        (tiny_capture, tiny_capture / "images"), tmp_path / "scene", config, *told, kind=FileFormatError
+    )
+
+
 @pytest.mark.parametrize(
     ("numbers", "told"),
     [

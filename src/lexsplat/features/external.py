@@ -26,6 +26,9 @@ log = logging.getLogger("lexsplat")
 
 _FLOATS = ("F64", "F32", "F16", "BF16")
 
+_READ_FIRST = 1 << 24
+"""Bytes of an array that are read to find NaN before a build starts."""
+
 
 def load_external_features(
     folder: Path,
@@ -85,7 +88,9 @@ def load_external_features(
 
 
 def check_external_features(folder: Path, capture: Capture, dimension: int | None = None) -> None:
-    """Refuse arrays whose .npy headers are wrong, before anything that takes time; values are checked on access.
+    """Refuse arrays that are wrong by their headers or not finite, before anything that takes time.
+
+    Of a large .npy array only every so many rows are read here; the rest is checked on access, as other files are.
 
     Args:
         folder: Folder of the arrays (`load_external_features`).
@@ -93,7 +98,7 @@ def check_external_features(folder: Path, capture: Capture, dimension: int | Non
         dimension: See `load_external_features`.
 
     Raises:
-        FileFormatError: If a view has no array, or one has a wrong shape or type.
+        FileFormatError: If a view has no array, or one has a wrong shape or type, or NaN.
     """
     sources = external_sources(folder, capture)
     for name in capture.train_names:
@@ -101,10 +106,19 @@ def check_external_features(folder: Path, capture: Capture, dimension: int | Non
         if path.name.endswith("_f.npy"):
             of_segments, _ = reading.open_segments(path)
             _check_depth(of_segments.shape[1], dimension, path)
+            _check_finite(of_segments, path)
         elif path.suffix == ".npy":
-            shape = _open_features(path).shape
-            reading.check_aspect(shape, path)
-            _check_depth(shape[-1], dimension, path)
+            array = _open_features(path)
+            reading.check_aspect(array.shape, path)
+            _check_depth(array.shape[-1], dimension, path)
+            _check_finite(array, path)
+
+
+def _check_finite(array: NDArray, path: Path) -> None:
+    """Refuse NaN and infinity in the rows that fit `_READ_FIRST`."""
+    rows = array[:: 1 + array.nbytes // _READ_FIRST]
+    if not np.isfinite(rows).all():
+        raise wrong(path, "finite numbers", "NaN or infinity")
 
 
 def read_external_features(maps: FeatureMaps, folder: Path, listener: Listener = silent) -> None:

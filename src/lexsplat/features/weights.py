@@ -148,7 +148,7 @@ def _cause(path: Path, error: Exception) -> str:
     """What is wrong with a pickled file; torch explains at length how to run the code in it."""
     if isinstance(error, OSError | MemoryError) or "allocate memory" in str(error):
         return _named(error)
-    if "Unsupported global" in str(error):
+    if "unsupported global" in str(error).lower():
         return "other objects"
     return "a damaged file" if path.stat().st_size else "an empty file"
 
