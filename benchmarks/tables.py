@@ -60,7 +60,7 @@ COMMANDS = {
 SCENES = {"demo": "demo", "second": "second scene", "bonsai": "bonsai"}
 METHODS = {
     "averaged": "averaged (default)",
-    "trained-feature": "trained (the paper's method, 1,000 steps)",
+    "trained-feature": "trained (1,000 of the paper's 30,000 steps)",
     "nearest": "nearest (reference, uses the evaluated photo)",
 }
 QUALITY = ("mIoU", "mIoU_oracle", "mAP", "localization")
