@@ -55,6 +55,14 @@ def refused(
     assert not output.exists(), "nothing half-written, and no empty folder"
 
 
+def test_an_empty_output_folder_stays_and_stays_empty_after_a_refused_build(photos, tmp_path):
+    output = tmp_path / "scene"
+    output.mkdir()
+    with pytest.raises(ModelError):
+        build(photos, output, replace(CONFIG, clip=str(tmp_path / "nowhere")))
+    assert list(output.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("cameras", "named"),
     [(False, ""), (True, ""), (True, "transforms.json")],

@@ -111,7 +111,8 @@ def build(
     if device == "cuda":
         require_gsplat()  # before anything that takes time
     folder = _output_folder(source, Path(output))
-    is_new = not folder.root.exists()
+    existed = folder.root.exists()
+    is_new = not existed or not any(folder.root.iterdir())
     above = [place for place in folder.root.absolute().parents if not place.exists()]
     given = (source,) if source is not None and source.is_dir() else ()  # of a video workers get the frames
     with open_workers(config.workers, given) as workers, folder.locked(), warnings_once():
@@ -145,7 +146,7 @@ def build(
             return builder.run(until)
         except (BackendError, CaptureError, FileFormatError, ModelError, MemoryBudgetError, OSError):
             if is_new:  # the lock is held, so nobody else uses the folder
-                folder.withdraw(above)
+                folder.withdraw(above, keep_root=existed)
             raise
 
 

@@ -226,11 +226,12 @@ class SceneFolder:
             ),
         )
 
-    def withdraw(self, made: Iterable[Path] = ()) -> None:
+    def withdraw(self, made: Iterable[Path] = (), *, keep_root: bool = False) -> None:
         """Remove the record of a build that ended before its first stage; a folder with other files stays.
 
         Args:
             made: Folders above it that the build made, the nearest first; they go if they are empty.
+            keep_root: Leave the empty folder, because it was there before.
         """
         files = [path for path in self.root.rglob("*") if not path.is_dir()]
         begun = {self.root / name for name in (".lock", "scene.json", "cameras.json")}
@@ -239,7 +240,7 @@ class SceneFolder:
         for path in files:
             path.unlink(missing_ok=True)
         folders = sorted(path for path in self.root.rglob("*") if path.is_dir())
-        for path in [*reversed(folders), self.root, *made]:
+        for path in [*reversed(folders), *([] if keep_root else [self.root]), *made]:
             with contextlib.suppress(OSError):
                 path.rmdir()
 
