@@ -220,6 +220,13 @@ def test_the_time_of_the_features_is_reported_first(clip_folder, tmp_path, caplo
     assert "words match bundled images by" in caplog.text, "random weights match no words"
 
 
+@pytest.mark.parametrize(("photos", "told"), [(99, False), (5_000, True)])
+def test_bundled_encoders_tell_the_time_of_many_photos_first(photos, told, caplog):
+    with caplog.at_level(NOTE, logger="lexsplat"):
+        check_encoders(CONFIG.resolved("cpu", (96, 72)), demo_capture("second"), photos, (96, 72))
+    assert (f"for {photos:,} training photos" in caplog.text or "at most" in caplog.text) == told
+
+
 def test_a_build_that_stops_for_its_encoder_goes_on_from_what_was_finished(
     tiny_capture, tmp_path, monkeypatch
 ):

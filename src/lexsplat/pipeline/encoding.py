@@ -30,6 +30,8 @@ log = logging.getLogger("lexsplat")
 
 _TOLD_FROM = 12
 """Fewest photos for which the time is estimated here: the estimate takes about as long as one photo."""
+_MANY = 100
+"""Fewest photos for which the bundled encoders, too, are timed before structure from motion."""
 
 
 BUNDLED_SCENES = Path(__file__).resolve().parents[1] / "demo"
@@ -105,7 +107,7 @@ def check_encoders(
 ) -> Encoders:
     """Load the encoders of the settings, check them, and log how long the features will take.
 
-    The bundled encoders are only looked at by name.
+    The bundled encoders are only looked at by name, and timed where there are at least `_MANY` photos.
 
     Args:
         config: Resolved settings.
@@ -138,6 +140,8 @@ def check_encoders(
     if config.features.tokens != "class":
         check_patches(folder, config.clip)
     if config.clip == "bundled" and config.dino in ("bundled", "none"):
+        if photos >= _MANY:
+            _estimate(encoders, config, photos, size)
         return encoders
     log.log(NOTE, "the encoders are loaded, checked and timed")
     listener(Event("encoders", 0, 4))
@@ -157,10 +161,15 @@ def check_encoders(
         check_dense(encoders.dino)
     listener(Event("encoders", 3, 4))
     if photos:
-        encoders.estimate = estimate(encoders.clip, encoders.dino, config.features, size)
-        _tell(encoders, photos, at_most=may_leave_photos_out(config))
+        _estimate(encoders, config, photos, size)
     listener(Event("encoders", 4, 4))
     return encoders
+
+
+def _estimate(encoders: Encoders, config: BuildConfig, photos: int, size: tuple[int, int]) -> None:
+    """Measure one photo and log the time of all, before the photos are read."""
+    encoders.estimate = estimate(encoders.clip, encoders.dino, config.features, size)
+    _tell(encoders, photos, at_most=may_leave_photos_out(config))
 
 
 def _tell_time(capture: Capture, config: BuildConfig, encoders: Encoders, cache_dir: Path) -> None:
