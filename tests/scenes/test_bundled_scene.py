@@ -114,9 +114,10 @@ def test_the_first_question_about_a_part_searches_no_neighbors_in_a_warm_process
     scene, things = served.scene, things_with_parts(served.scene)
     assert {"mug", "teddy bear", "toy car"} < set(things)
     assert not {"table", "wall", "floor"} & set(things)
-    assert len(scene.graphs) == len(things)
+    known = len(scene.graphs)
+    assert known >= len(things)
     assert scene.ask(["mug handle", "bear nose", "car wheels"]).presences == ("yes", "yes", "yes")
-    assert len(scene.graphs) == len(things)
+    assert len(scene.graphs) == known
 
 
 def test_a_part_that_several_objects_have_is_that_of_each(demo):

@@ -95,7 +95,8 @@ def test_what_nothing_contradicts_has_no_such_note(demo, phrase):
 def test_a_color_of_another_name_of_a_thing_is_that_of_its_pixels(demo, phrase, name):
     found = demo.find(phrase)
     assert (found.present, found.count) == ("yes", 1)
-    assert torch.equal(found.mask, listed(demo, name).mask)
+    thing = listed(demo, name)
+    assert int((found.mask ^ thing.mask).sum()) <= 0.02 * len(thing)
 
 
 @pytest.mark.slow

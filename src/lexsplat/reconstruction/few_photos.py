@@ -41,7 +41,7 @@ def has_few_photos(capture: Capture) -> bool:
 
 
 def points_between(
-    capture: Capture, known: InitialPoints, seed: int = 0, *, enough: int = ENOUGH_POINTS
+    capture: Capture, known: InitialPoints, seed: int = 0, *, enough: int | None = None
 ) -> InitialPoints:
     """The known points, and points at random pixels of the training views.
 
@@ -51,13 +51,15 @@ def points_between(
         capture: The capture, at the size of the training.
         known: Points of structure from motion.
         seed: Seed of the pixels.
-        enough: Number of points up to which some are added, where there are pixels enough.
+        enough: Number of points up to which some are added, where there are pixels enough; None takes
+            `ENOUGH_POINTS`.
 
     Raises:
         CaptureError: If a photo cannot be read.
     """
     views, rng = capture.train_views, np.random.default_rng(seed)
     pixels = sum(view.camera.width * view.camera.height for view in views)
+    enough = ENOUGH_POINTS if enough is None else enough
     lacking = max(0, min(enough, pixels // PIXELS_A_POINT) - len(known.points))
     share = lacking / max(pixels, 1)
     found = [_points_of(view, known.points, share, rng) for view in views]
