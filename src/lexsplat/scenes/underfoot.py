@@ -21,9 +21,11 @@ _NEIGHBORS = 64
 _RANK = 5
 """Of the neighbors' colors, the one of this rank counts, from 0: a few strays are of any color."""
 _FEWEST = 16
-"""Gaussians that rise from the surface, at least: what lies flat altogether is a sheet on it."""
+"""Fewest Gaussians that rise from the surface; a thing with fewer is a sheet that lies on it."""
 _REACH = 2.5
 """Radii of a thing around its center in which the surface is looked at."""
+_ROWS = 8192
+"""Gaussians whose neighbors' colors are in memory at once."""
 _LEVEL = 0.9
 """Share of the surface's own Gaussians that are no farther from the height around them than is level."""
 _UNLIKE = 25.0
@@ -73,7 +75,7 @@ def underfoot(thing: Selection, surfaces: torch.Tensor, labels: torch.Tensor) ->
     own, theirs = (_cielab(thing, index) for index in (thing.indices, places))
     points = thing.points[0]
     nearest = body[cKDTree(points[body]).query(points, k=min(_NEIGHBORS, len(body)))[1]]
-    unlike_surface, unlike_thing = _difference(own, theirs[beside]), _difference(own, own[nearest])
+    unlike_surface, unlike_thing = _difference(own, theirs, beside), _difference(own, own, nearest)
     alike = unlike_surface < np.minimum(unlike_thing, _UNLIKE)
     level_too = np.abs(raised) <= thick
     segments, weights = labels[thing.indices].cpu().numpy(), thing.points[1]
@@ -94,8 +96,17 @@ def _cielab(thing: Selection, index: torch.Tensor) -> FloatArray:
     return cielab(colors_of(thing.gaussians.select(index)).astype(np.float64) / 255)
 
 
-def _difference(colors: FloatArray, others: FloatArray) -> FloatArray:
-    """The difference of each color ``[M, 3]`` from the one of rank `_RANK` among others ``[M, K, 3]``."""
-    apart = np.linalg.norm(others - colors[:, None], axis=2)
-    rank = min(_RANK, apart.shape[1] - 1)
-    return np.asarray(np.partition(apart, rank, axis=1)[:, rank])
+def _difference(colors: FloatArray, others: FloatArray, near: NDArray[np.intp]) -> FloatArray:
+    """The difference of each color ``[M, 3]`` from the one of rank `_RANK` among its neighbors.
+
+    Args:
+        colors: CIELAB ``[M, 3]``.
+        others: Those of which some are neighbors ``[S, 3]``.
+        near: The neighbors of each ``[M, K]``.
+    """
+    found, rank = np.empty(len(colors)), min(_RANK, near.shape[1] - 1)
+    for start in range(0, len(colors), _ROWS):
+        rows = slice(start, start + _ROWS)
+        apart = np.linalg.norm(others[near[rows]] - colors[rows, None], axis=2)
+        found[rows] = np.partition(apart, rank, axis=1)[:, rank]
+    return found
