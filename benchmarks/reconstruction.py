@@ -46,6 +46,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "regularized": {"opacity_weight": 0.01, "scale_weight": 0.01},
     "degree-1": {"sh_degree": 1},
     "exposure": {"exposure": True},
+    "regularized-exposure": {"opacity_weight": 0.01, "scale_weight": 0.01, "exposure": True},
 }
 """Variants by name, and the fields of `ReconstructionConfig` that they change."""
 
@@ -62,7 +63,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     rows = []
-    print(f"{'capture':14} {'variant':12}  points seed   PSNR   SSIM  Gaussians  seconds")
+    print(f"{'capture':14} {'variant':20}  points seed   PSNR   SSIM  Gaussians  seconds")
     for wish in options.captures:
         name, _, downscale = wish.partition("=")
         scene, config = prepared(name, float(downscale) if downscale else None, options)
@@ -75,7 +76,7 @@ def main() -> None:
             row |= measured(scene, changed, points, seed, options.device)
             rows.append(row)
             print(
-                f"{row['capture']:14} {variant:12} {row['points']:7,} {seed:4} {row['psnr']:6.2f} {row['ssim']:6.3f}"
+                f"{row['capture']:14} {variant:20} {row['points']:7,} {seed:4} {row['psnr']:6.2f} {row['ssim']:6.3f}"
                 f" {row['gaussians']:10,} {row['seconds']:8.1f}",
                 flush=True,
             )

@@ -76,7 +76,7 @@ def test_many_photos_start_from_the_known_points_alone(capture, monkeypatch, cap
     def refuse(*_):
         raise AssertionError("points were added")
 
-    monkeypatch.setattr("lexsplat.reconstruction.points_between", refuse)
+    monkeypatch.setattr("lexsplat.reconstruction.few_photos.points_between", refuse)
     monkeypatch.setattr(few_photos, "FEW_PHOTOS", len(capture.train_names) - 1)
     reconstruct(capture, SHORT)
     assert not caplog.records

@@ -1,7 +1,8 @@
 """``lexsplat ablate``: the paper's Table 2 over several seeds, for one method or several.
 
 Every variant leaves one part of a method out. Gaussians and features are shared by all variants, codebooks by those
-with the same quantization; the seeds are those of codebook and language. With labels corrupted on purpose
+with the same quantization; the seeds are those of codebook and language. Variants that are trained jointly train the
+same Gaussians again, since the language does not change them. With labels corrupted on purpose
 (`with_wrong_labels`) the same table is a stress test.
 """
 
@@ -17,12 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lexsplat.evaluation import EvaluationConfig
-from lexsplat.evaluation.experiments import Bench, Row, require_each_once
+from lexsplat.evaluation.experiments import Bench, Made, Row, require_each_once
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
-from lexsplat.language.methods import METHODS, FitRun, MethodName, TrainingViews
+from lexsplat.language.methods import JOINT_METHODS, METHODS, FitRun, MethodName, TrainingViews
 from lexsplat.language.methods.averaged import features_of_codes
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.queries.relevancy import QueryForm
+from lexsplat.reconstruction import Reconstructor
+from lexsplat.reconstruction.few_photos import starting_points
 
 log = logging.getLogger("lexsplat")
 
@@ -158,17 +162,22 @@ def language_row(
     """
     settings = [config.method, *(getattr(config, part) for part in METHODS[config.method].settings)]
     settings += [wrong_labels] if wrong_labels else []
+    settings += ["jointly"] if is_joint(bench, config) else []
     return Row(
         name, settings, lambda seed: make_language(bench, replace(config, seed=seed), wrong_labels), form
     )
 
 
-def make_language(
-    bench: Bench, config: BuildConfig, wrong_labels: float = 0.0
-) -> tuple[LanguageField, dict[str, float]]:
-    """Make the language field of the settings; returns it with the seconds of its stages.
+def is_joint(bench: Bench, config: BuildConfig) -> bool:
+    """Whether a row trains its language together with Gaussians of its own (``--joint``, ``--as-in-paper``)."""
+    return bench.joint and config.method in JOINT_METHODS
 
-    A method without index maps is fitted to the features of the wrong codes instead of wrong labels.
+
+def make_language(bench: Bench, config: BuildConfig, wrong_labels: float = 0.0) -> Made:
+    """Make the language field of the settings.
+
+    A method without index maps is fitted to the features of the wrong codes instead of wrong labels. A training that
+    was stopped goes on from its checkpoint.
     """
     method, seconds = METHODS[config.method], {}
     views = TrainingViews({name: bench.capture.views[name] for name in bench.capture.train_names})
@@ -184,8 +193,37 @@ def make_language(
         views = replace(
             views, features=features_of_codes(code_maps, codebook) if wrong_labels else bench.maps
         )
-    scratch = bench.folder.root / "checkpoints"
-    run = FitRun(seed=config.seed, memory=config.memory_bytes, scratch=scratch, listener=bench.listener)
-    field = method.fit(bench.gaussians, views, config, run)
+    joint = is_joint(bench, config)
+    checkpoint = bench.checkpoint([method.name, config, wrong_labels, joint])
+    run = FitRun(
+        seed=config.seed,
+        memory=config.memory_bytes,
+        scratch=bench.folder.root / "checkpoints",
+        checkpoint=checkpoint,
+        listener=bench.listener,
+    )
+    gaussians = None
+    if joint:
+        gaussians, field = _trained_jointly(bench, config, views, run)
+    else:
+        field = method.fit(bench.gaussians, views, config, run)
     field.method = method.name
-    return field, {**seconds, "language": time.perf_counter() - start}
+    checkpoint.remove()
+    seconds["reconstruct" if joint else "language"] = checkpoint.seconds_before + time.perf_counter() - start
+    return Made(field, seconds, gaussians)
+
+
+def _trained_jointly(
+    bench: Bench, config: BuildConfig, views: TrainingViews, run: FitRun
+) -> tuple[Gaussians, LanguageField]:
+    """Gaussians and language, trained together; the Gaussians start from the points and the seed of the bench's."""
+    seed, cache = bench.config.seed, bench.folder.root / "checkpoints" / "points"
+    points = starting_points(
+        bench.capture, seed=seed, cache_dir=cache, memory=run.memory, listener=run.listener
+    )
+    reconstructor = Reconstructor(
+        bench.capture, config.reconstruction, points, device=bench.device, seed=seed, memory=run.memory
+    )
+    training = JOINT_METHODS[config.method].joined(reconstructor, views, config, run.seed)
+    training.run(run.listener, run.checkpoint)
+    return training.result()

@@ -89,6 +89,6 @@ def _row(bench: Bench, name: str) -> Row:
         start = time.perf_counter()
         classes = embed_prompts(prompts, bench.encode_text) if prompts else None
         run = BaselineRun(cameras, classes, seed, bench.config.memory_bytes, bench.listener)
-        return baseline.fit(data, run), {name: time.perf_counter() - start}
+        return Made(baseline.fit(data, run), {name: time.perf_counter() - start})
 
     return Row(name, key, make)

@@ -1,7 +1,8 @@
 """A bench for several methods or variants on the same Gaussians and features, for ``ablate`` and ``compare``.
 
 Gaussians and features are made once (``OUTPUT/scene``, a scene folder that ``build`` can resume), codebooks once for
-each setting and seed. Every measured run is kept, so that an interrupted command resumes where it stopped.
+each setting and seed. A row that is trained jointly trains the same Gaussians again. Every measured run is kept, and
+the state of a training, so that an interrupted command resumes where it stopped.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -36,6 +37,7 @@ from lexsplat.evaluation.ground_truth import read_held_out
 from lexsplat.evaluation.report import Gallery, MeasuredMethod, table_rows, write_comparison, write_rows
 from lexsplat.evaluation.results import plain
 from lexsplat.features import TextCache, load_level_maps
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.code_maps import MaskedCodeMaps
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.methods import METHODS
@@ -50,6 +52,7 @@ from lexsplat.runtime.errors import CaptureError, FileFormatError, SceneFolderEr
 from lexsplat.runtime.files import read_json, read_tensors, to_json, write_json, write_tensors
 from lexsplat.runtime.fingerprints import file_hash, fingerprint
 from lexsplat.runtime.progress import Listener, silent
+from lexsplat.runtime.training import Checkpoint
 from lexsplat.scenes.scene import Scene
 
 log = logging.getLogger("lexsplat")
@@ -60,8 +63,19 @@ IMAGE_WIDTH = 240
 Peaks = dict[str, int | None]
 """Peak host and GPU memory in bytes, by the names in ``metrics.json``."""
 
-Made = tuple[LanguageField | Method, dict[str, float]]
-"""A language and the seconds of its stages."""
+
+class Made(NamedTuple):
+    """A language that was made for a row.
+
+    Args:
+        language: The language.
+        seconds: Seconds of its stages.
+        gaussians: Those that it was trained together with; None where they are the bench's.
+    """
+
+    language: LanguageField | Method
+    seconds: dict[str, float]
+    gaussians: Gaussians | None = None
 
 
 @dataclass(frozen=True)
@@ -142,8 +156,10 @@ class Bench:
             )
         check_ground_truth_options(source, self.origin.masks, self.origin.prompt_list)
         self.output, self.listener, self.evaluation = output, listener, evaluation
-        self.as_in_paper = config.as_in_paper  # all rows share one geometry, so none is trained jointly
-        config = replace(config.spelled_out(), joint=False, as_in_paper=False)
+        config = config.spelled_out()
+        self.as_in_paper, self.joint = config.as_in_paper, config.joint
+        # Gaussians and features are made first; a row that is trained jointly trains Gaussians of its own.
+        config = replace(config, joint=False, as_in_paper=False)
         preview = preview_capture(source, output, config)
         if preview is not None:  # before the build, which takes long
             read_held_out(preview, self.origin)
@@ -167,7 +183,7 @@ class Bench:
             self.capture, self.config, self._encoders, self.folder.features_path, listener
         )
         self._texts = TextCache(self.folder.root / "checkpoints" / "texts")
-        self._last: tuple[str, LanguageField | Method, dict[str, float], Peaks] | None = None
+        self._last: tuple[str, Made, Peaks] | None = None
         self._codebook_peaks: Peaks = {}
 
     # -- shared stages
@@ -225,6 +241,12 @@ class Bench:
         facts = {"seconds": f"{seconds:.3f}", "peaks": json.dumps(self._codebook_peaks)}
         write_tensors(path, {**codebook.tensors(), **stored}, facts)
         return codebook.to(self.device), dict(MaskedCodeMaps(maps, views)), seconds
+
+    def checkpoint(self, inputs: Sequence[Any]) -> Checkpoint:
+        """Where the training of a row saves its state, by everything that it depends on besides the shared stages."""
+        path = self.output / "checkpoints" / "training.safetensors"
+        key = fingerprint(self._stages(), list(inputs), code_identity())
+        return Checkpoint(path, key, every=self.config.checkpoint_seconds)
 
     def _stages(self) -> list[str]:
         """Fingerprints of the shared stages."""
@@ -314,20 +336,18 @@ class Bench:
                     return MeasuredRun(stored["metrics"], detail, images if images.is_file() else None)
             except (FileFormatError, KeyError, TypeError) as error:
                 log.warning("%s is damaged and is measured again (%s)", path, error)
-        language, seconds, peaks = self._made(
-            fingerprint(self._stages(), settings, seed), lambda: row.make(seed)
-        )
+        made, peaks = self._made(fingerprint(self._stages(), settings, seed), lambda: row.make(seed))
         gallery = Gallery(width=IMAGE_WIDTH)
         shared = self.folder.stage_seconds()
         metrics = evaluate(
             self.capture,
-            self._scene_of(language, query),
+            self._scene_of(made, query),
             self.evaluation,
             ground_truth=self.ground_truth,
             observer=gallery.add if keep_images else None,
             listener=self.listener,
         ).with_facts(
-            stage_seconds={stage: shared[stage] for stage in ("reconstruct", "features")} | seconds,
+            stage_seconds={stage: shared[stage] for stage in ("reconstruct", "features")} | made.seconds,
             settings={"name": row.name, "seed": seed},
             machine=machine_facts(),
         )
@@ -339,30 +359,29 @@ class Bench:
         write_json(path, stored)
         return MeasuredRun(result, detail, images if keep_images else None)
 
-    def _made(
-        self, key: str, make: Callable[[], Made]
-    ) -> tuple[LanguageField | Method, dict[str, float], Peaks]:
-        """The language, its seconds and peaks; a language that is measured in two forms is made once."""
+    def _made(self, key: str, make: Callable[[], Made]) -> tuple[Made, Peaks]:
+        """The language and its peaks; a language that is measured in two forms is made once."""
         if self._last is None or self._last[0] != key:
             self._last, self._codebook_peaks = None, {}  # frees the language made before
             self.maps.forget()
             forget_peak_memory()
-            language, seconds = make()
+            made = make()
             peaks = {
                 name: _larger(peak, self._codebook_peaks.get(name)) for name, peak in self._peaks().items()
             }
-            self._last = (key, language, seconds, peaks)
+            self._last = (key, made, peaks)
         return self._last[1:]
 
     def _peaks(self) -> Peaks:
         return {"peak_rss_bytes": peak_memory(), "peak_gpu_bytes": peak_gpu_memory(self.device)}
 
-    def _scene_of(self, language: LanguageField | Method, query: QueryConfig) -> Scene | MethodScene:
-        if isinstance(language, Method):
+    def _scene_of(self, made: Made, query: QueryConfig) -> Scene | MethodScene:
+        gaussians = self.gaussians if made.gaussians is None else made.gaussians
+        if isinstance(made.language, Method):
             cameras = [view.camera for view in self.capture.train_views]
-            return MethodScene(self.gaussians, language, cameras, self.encode_text, query)
+            return MethodScene(gaussians, made.language, cameras, self.encode_text, query)
         views, clip = self.folder.read_cameras(), self.config.clip
-        return Scene(self.gaussians, language, views, clip, query, self.folder, self.encode_text)
+        return Scene(gaussians, made.language, views, clip, query, self.folder, self.encode_text)
 
     @cached_property
     def _ground_truth_identity(self) -> list[Any]:

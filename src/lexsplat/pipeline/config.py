@@ -83,8 +83,7 @@ class BuildConfig:
         joint: Train language together with geometry, as in the paper; needs method "trained".
         as_in_paper: Build and ask as the paper describes it (docs/paper.md): method "trained", jointly, 30,000 steps
             over full maps, random crops, rasterization without the mip filter, prompts relative to canonical phrases
-            with a fixed threshold. Settings that are given otherwise are kept. Compare and ablate train language
-            after the geometry, which their rows share.
+            with a fixed threshold. Settings that are given otherwise are kept.
         poses: Structure from motion, for photos without cameras and for videos.
         reconstruction: Geometry and appearance.
         features: Dense CLIP and DINO features. Settings left at their default take the value that suits the encoder

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lexsplat.captures import Capture
-from lexsplat.captures.sfm.triangulation import InitialPoints, initial_points
+from lexsplat.captures.sfm.triangulation import InitialPoints
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, parse_vector
 from lexsplat.language.methods import JOINT_METHODS, FitRun, JointMethod, TrainingViews
@@ -22,6 +22,7 @@ from lexsplat.pipeline.viewpoints import splats_of_capture
 from lexsplat.reconstruction import Reconstructor, check_gaussians, compile_kernels, reconstruct, tell_time
 from lexsplat.reconstruction.block_training import BlockRun, reconstruct_blocks
 from lexsplat.reconstruction.blocks import number_of_blocks
+from lexsplat.reconstruction.few_photos import starting_points
 from lexsplat.runtime.progress import uncounted
 from lexsplat.scenes.folder import SceneFolder
 
@@ -54,7 +55,7 @@ class GeometryRun:
     def initial_points(self) -> InitialPoints:
         """The points from which Gaussians start, kept for the next run."""
         fit, cache = self.fit, self.checkpoints / "points"
-        return initial_points(
+        return starting_points(
             self.capture, seed=fit.seed, cache_dir=cache, memory=fit.memory, listener=fit.listener
         )
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from lexsplat.geometry.gaussians import Gaussians
-from lexsplat.reconstruction.few_photos import has_few_photos, points_between, warn_of_few_photos
+from lexsplat.reconstruction.few_photos import has_few_photos, starting_points, warn_of_few_photos
 from lexsplat.reconstruction.first_run import compile_kernels
 from lexsplat.reconstruction.forecasting import tell_time
 from lexsplat.reconstruction.settings import LONG_TRAINING, ReconstructionConfig
@@ -64,18 +64,13 @@ def reconstruct(
         CaptureError: If a photo cannot be read.
         MemoryBudgetError: If the Gaussians, or the photos during triangulation, do not fit into ``memory``.
     """
-    from lexsplat.captures.sfm.triangulation import initial_points
-
     check_gaussians(config, device, memory)
-    points = initial_points(capture, seed=seed, cache_dir=cache_dir, memory=memory, listener=listener)
-    few = has_few_photos(capture)
-    if few and points.origin != "random":
-        points = points_between(capture, points, seed)
+    points = starting_points(capture, seed=seed, cache_dir=cache_dir, memory=memory, listener=listener)
     compile_kernels(device, listener)
     tell_time(capture, config, points, device=device, memory=memory, listener=listener)
     trainer = Reconstructor(capture, config, points, device=device, seed=seed, memory=memory)
     trainer.run(listener, checkpoint)
-    if few:
+    if has_few_photos(capture):
         warn_of_few_photos(capture, trainer.gaussians())
     return trainer.gaussians()
 

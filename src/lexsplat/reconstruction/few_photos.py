@@ -16,9 +16,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lexsplat.geometry.gaussians import Gaussians
+from lexsplat.runtime import memory as budget
+from lexsplat.runtime.progress import Listener, silent
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from pathlib import Path
 
     from lexsplat.captures import Capture, View
     from lexsplat.captures.sfm.triangulation import InitialPoints
@@ -38,6 +41,34 @@ points of structure from motion they gain 1 dB, with 769 nothing, and 5,000 in p
 def has_few_photos(capture: Capture) -> bool:
     """Whether a capture has so few training views that it is treated as few photos."""
     return len(capture.train_views) <= FEW_PHOTOS
+
+
+def starting_points(
+    capture: Capture,
+    *,
+    seed: int = 0,
+    cache_dir: Path | None = None,
+    memory: int = budget.DEFAULT_MEMORY,
+    listener: Listener = silent,
+) -> InitialPoints:
+    """The points from which a training starts: the initial points, with more between them for few photos.
+
+    Args:
+        capture: The capture, at the size of the training.
+        seed: Seed of all that is random.
+        cache_dir: Folder where triangulated points are kept; None keeps nothing.
+        memory: Bytes of host memory for the triangulation.
+        listener: Receives progress events of the triangulation.
+
+    Raises:
+        CaptureError: If a photo cannot be read.
+    """
+    from lexsplat.captures.sfm.triangulation import initial_points
+
+    points = initial_points(capture, seed=seed, cache_dir=cache_dir, memory=memory, listener=listener)
+    if has_few_photos(capture) and points.origin != "random":
+        return points_between(capture, points, seed)
+    return points
 
 
 def points_between(
