@@ -43,9 +43,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "classic": {"antialiased": False},
     "half-cap": {"max_gaussians": 20_000},
     "quarter-cap": {"max_gaussians": 10_000},
-    "regularized": {"opacity_weight": 0.01, "scale_weight": 0.01},
     "degree-1": {"sh_degree": 1},
-    "exposure": {"exposure": True},
+    # The default is the first of these for many photos and the last for few.
+    "plain": {"opacity_weight": 0.0, "scale_weight": 0.0, "exposure": False},
+    "regularized": {"opacity_weight": 0.01, "scale_weight": 0.01, "exposure": False},
+    "exposure": {"opacity_weight": 0.0, "scale_weight": 0.0, "exposure": True},
     "regularized-exposure": {"opacity_weight": 0.01, "scale_weight": 0.01, "exposure": True},
 }
 """Variants by name, and the fields of `ReconstructionConfig` that they change."""

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from lexsplat.evaluation.metrics import psnr
-from lexsplat.reconstruction import ReconstructionConfig, few_photos, reconstruct
+from lexsplat.reconstruction import (
+    LONG_TRAINING,
+    ReconstructionConfig,
+    Reconstructor,
+    few_photos,
+    reconstruct,
+)
 from lexsplat.reconstruction.few_photos import points_between
 from lexsplat.rendering import render
 
@@ -106,3 +112,16 @@ def test_a_warning_states_how_well_held_out_photos_are_rendered(capture, caplog)
     reconstruct(dataclasses.replace(capture, test_names=()), SHORT)
     assert "dB" not in caplog.text
     assert "are few" in caplog.text
+
+
+def test_few_photos_are_regularized_and_their_exposure_is_fitted(capture, points, monkeypatch):
+    def settings(config):
+        found = Reconstructor(capture, config, points).config
+        return found.opacity_weight, found.scale_weight, found.exposure
+
+    assert settings(SHORT) == (0.01, 0.01, True)
+    assert settings(dataclasses.replace(SHORT, exposure=False, scale_weight=0.5)) == (0.01, 0.5, False)
+    assert settings(dataclasses.replace(SHORT, iterations=LONG_TRAINING)) == (0, 0, False), "as measured"
+    monkeypatch.setattr(few_photos, "FEW_PHOTOS", len(capture.train_names) - 1)
+    assert settings(SHORT) == (0, 0, False)
+    assert settings(dataclasses.replace(SHORT, strategy="mcmc")) == (0.01, 0.01, False)

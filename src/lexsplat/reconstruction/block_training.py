@@ -32,6 +32,7 @@ from lexsplat.reconstruction.block_files import (
 from lexsplat.reconstruction.block_visits import VisitReconstructor, adam_steps, calm_factor, visit_seed
 from lexsplat.reconstruction.blocks import Blocks, cut_blocks, ground_axes
 from lexsplat.reconstruction.densification import DensityControl
+from lexsplat.reconstruction.few_photos import has_few_photos
 from lexsplat.reconstruction.first_run import compile_kernels
 from lexsplat.reconstruction.forecasting import tell_time_of_blocks
 from lexsplat.reconstruction.optimizers import adam, load_optimizer_tensors
@@ -120,7 +121,8 @@ def reconstruct_blocks(
         TrainingError: If a block diverges; finished visits are kept.
         WorkersError: If a worker comes later that does not see ``run.folder``, as the others do.
     """
-    config = replace(config, cool_down=0.0)  # `CALM` takes its place
+    # Few are the photos of the whole, and `CALM` takes the place of the cool-down.
+    config = replace(config.for_photos(has_few_photos(capture)), cool_down=0.0)
     cap = config.cap(torch.device(run.device))
     deal = run.device != "cpu" or 2 * cap * budget.GAUSSIAN_BYTES <= run.memory
     blocks = cut_blocks(capture, points.points, ground_axes(up), count, deal=deal)

@@ -6,7 +6,7 @@ iterations and is scaled to the actual number.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -66,7 +66,8 @@ class ReconstructionConfig:
             the first reset removes Gaussians larger than a tenth of the scene; None enables it from 15,000
             iterations on, where the training has time to recover.
         noise: Strength of the noise of "mcmc", times the learning rate of the means.
-        opacity_weight: Weight of the mean opacity in the loss; None is 0.01 with "mcmc", else 0.
+        opacity_weight: Weight of the mean opacity in the loss; None is 0.01 with "mcmc", and for at most 25 training
+            photos in trainings shorter than 15,000, else 0.
         scale_weight: Weight of the mean standard deviation (relative to the scene) in the loss; None as above.
         antialiased: Train and render with the mip filter; --reconstruction.no-antialiased leaves it out.
         initial_opacity: Opacity of the initial Gaussians.
@@ -75,7 +76,8 @@ class ReconstructionConfig:
         cool_down: Share of the iterations, at the end, over which all learning rates fall linearly to a twentieth, so
             that the last views do not count for more than the others; None is 0.25 in trainings shorter than 15,000,
             else 0.
-        exposure: Fit an affine color change per training photo, for captures whose exposure varies.
+        exposure: Fit an affine color change per training photo, for captures whose exposure varies; None does so for
+            at most 25 training photos in trainings shorter than 15,000.
         rate_scale: Factor of all learning rates but that of the opacities; None is the cube root of
             30,000 / iterations, between 1 and 3, so that a short training takes larger steps, and 1.6 times that
             where "default" has a cool-down to settle them.
@@ -108,7 +110,7 @@ class ReconstructionConfig:
     initial_opacity: float = 0.1
     warm_up: float | None = None
     cool_down: float | None = None
-    exposure: bool = False
+    exposure: bool | None = None
     rate_scale: float | None = None
     means_rate: float = 1.6e-4
     means_rate_final: float = 1.6e-6
@@ -193,12 +195,20 @@ class ReconstructionConfig:
             return 0.0
         return (0.0 if self.is_long else 0.15) if self.renewal is None else self.renewal
 
-    @property
-    def regularizers(self) -> tuple[float, float]:
-        """Weights of opacity and scale in the loss."""
-        default = 0.01 if self.strategy == "mcmc" else 0.0
-        given = (self.opacity_weight, self.scale_weight)
-        return tuple(default if weight is None else weight for weight in given)  # type: ignore[return-value]
+    def for_photos(self, few: bool) -> ReconstructionConfig:
+        """The same settings with what depends on the number of training photos filled in.
+
+        Few photos leave much open: lower opacities and scales, and a color change per photo, gain on new views
+        (docs/captures.md).
+        """
+        helps = few and not self.is_long
+        weight = 0.01 if helps or self.strategy == "mcmc" else 0.0
+        return replace(
+            self,
+            opacity_weight=weight if self.opacity_weight is None else self.opacity_weight,
+            scale_weight=weight if self.scale_weight is None else self.scale_weight,
+            exposure=helps if self.exposure is None else self.exposure,
+        )
 
     @property
     def scale_of_rates(self) -> float:

@@ -11,6 +11,7 @@ from torch import Tensor
 from lexsplat.geometry.gaussians import TENSORS, Gaussians, gaussians_from_points
 from lexsplat.reconstruction.densification import STATISTICS, DensityControl
 from lexsplat.reconstruction.exposures import Exposures
+from lexsplat.reconstruction.few_photos import has_few_photos
 from lexsplat.reconstruction.optimizers import (
     adam,
     below_prefix,
@@ -77,7 +78,7 @@ class Reconstructor:
     ) -> None:
         from lexsplat.reconstruction.image_losses import SMALLEST_SIDE
 
-        self.config = config
+        config = self.config = config.for_photos(has_few_photos(capture))
         self.device = torch.device(device)
         self.steps_done = 0
         self._photo_bytes = min(PHOTO_BYTES_MAX, memory // 4)
@@ -342,12 +343,11 @@ class Reconstructor:
         return self._images
 
     def _regularization(self) -> Tensor | float:
-        opacity_weight, scale_weight = self.config.regularizers
         total: Tensor | float = 0.0
-        if opacity_weight > 0:
-            total = total + opacity_weight * self._parameters["opacity_logits"].sigmoid().mean()
-        if scale_weight > 0:
-            total = total + scale_weight * self._parameters["log_scales"].exp().mean() / self._extent
+        if weight := self.config.opacity_weight:
+            total = total + weight * self._parameters["opacity_logits"].sigmoid().mean()
+        if weight := self.config.scale_weight:
+            total = total + weight * self._parameters["log_scales"].exp().mean() / self._extent
         return total
 
     def reads_loss(self, done: int) -> bool:
