@@ -11,7 +11,7 @@ from support.command_line import Terminal, fails_in_one_line, modified
 
 from lexsplat import cli, open_scene
 from lexsplat.cli.waiting import LateProgress
-from lexsplat.queries.visibility import whole_things
+from lexsplat.queries.visibility import with_remains
 from lexsplat.scenes import editing
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.scale import store_world
@@ -30,7 +30,7 @@ def test_an_edit_is_undone_redone_and_saved_and_the_new_scene_answers(built, tin
     original = open_scene(built, device="cpu")
     answering = original.scores(["blue ball"])[0] >= 0.05
     found = original.find("blue ball", threshold=0.05)  # without the strays that belong to no thing
-    rest = ~whole_things(found, original.hidden, original.field.segments).mask
+    rest = ~with_remains(found, original.hidden, original.field.segments).mask
     assert not (rest & found.mask).any()
     assert 20 < int((~rest).sum()) < len(rest) / 2
     strays = int((answering & rest).sum())
