@@ -17,7 +17,8 @@ from lexsplat.queries.selection import Selection
 from lexsplat.rendering import render
 from lexsplat.runtime.errors import FileFormatError
 from lexsplat.scenes.editing import Editor, Motion
-from lexsplat.scenes.filling import Fill, fill_for
+from lexsplat.scenes.filling import fill_for
+from lexsplat.scenes.fills import Fill
 from lexsplat.scenes.journal import Step
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.views import StoredView
@@ -360,3 +361,27 @@ def test_specks_that_only_a_deleted_thing_hid_go_with_it_and_others_stay():
         if bool(torch.isclose(editor.scene.gaussians.means, torch.tensor(place), atol=1e-6).all(1).any())
     }
     assert left == {"behind it, farther away", "beside it, in sight"}
+
+
+def test_what_a_deleted_thing_and_others_hid_together_is_filled_and_what_only_others_hid_is_not():
+    table, _ = checkered_table_with_a_box()
+    own = (table.field.codes[:, 0] == 1).numpy()
+    means = table.gaussians.means.double().numpy()
+    colors = table.gaussians.sh0[:, 0].double().numpy() * 0.28209479177387814 + 0.5
+    across, height = (
+        side.ravel() for side in np.meshgrid(np.arange(0.34, 1.3, 0.02), np.arange(0, 0.4, 0.02))
+    )
+    plate = np.stack([across, np.full_like(across, 0.2), height], 1)  # beside the box, before both places
+    together, others = np.array([0.36, 0.6, 0]), np.array([1.0, 0.42, 0])
+    apart = np.minimum(*(np.linalg.norm(means - place, axis=1) for place in (together, others)))
+    kept = ~own & (apart > 0.1)
+    points = np.concatenate([means[kept], plate, means[own]])
+    green = np.tile([0.1, 0.8, 0.1], (len(plate), 1))
+    scene = solid(points, np.concatenate([colors[kept], green, colors[own]]), int(own.sum()))
+    editor = Editor(scene)
+    editor.delete(box_of(scene))
+    left = editor.scene.gaussians.means.double().numpy()
+    nearest = cKDTree(left).query(np.stack([together, others]))[0]
+    assert nearest[0] < 0.03
+    assert nearest[1] > 0.08
+    assert cKDTree(left).query(plate)[0].max() < 1e-6, "the plate is whole"

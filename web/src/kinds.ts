@@ -86,12 +86,13 @@ export class Kinds {
     return result;
   }
 
-  /** Whether some splats are nearly all of an object. */
-  isMostly(place: number, taken: number[]): boolean {
+  /** Whether some splats are nearly all of what views show of an object: a green bottle has a cork, too. */
+  isMostly(place: number, taken: number[], masses: ArrayLike<number>): boolean {
     this.#places ??= this.#found();
     const isTaken = new Set(taken);
     const { splats } = this.#places[place];
-    return splats.filter((i) => isTaken.has(i)).length >= MOSTLY * splats.length;
+    const shown = (of: number[]): number => of.reduce((sum, i) => sum + masses[i], 0);
+    return shown(splats.filter((i) => isTaken.has(i))) >= MOSTLY * shown(splats);
   }
 
   /** The places of the objects of which some splats are at least half. */

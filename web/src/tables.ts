@@ -240,10 +240,11 @@ export class Tables implements Source {
     const sure = this.#hasColor(phrase, splats, held) && parts?.presence !== "unsure";
     if (presence === "yes" && sure && !isPart(phrase, words) && !isPartAlone(phrase, words)) {
       const noun = phrase.toLowerCase().split(" of ")[0].split(" ").at(-1)!;
+      const masses = this.segments?.masses ?? this.geometry.opacities;
       const named = this.kinds.named(singulars(noun)).filter((place) => {
         const { name } = this.kinds.entry(place);
         if (grammar.has("stuff", name)) return false;
-        return name === phrase.toLowerCase() || !this.#isQualified(phrase) || this.kinds.isMostly(place, splats);
+        return name === phrase.toLowerCase() || !this.#isQualified(phrase) || this.kinds.isMostly(place, splats, masses);
       });
       const isSurface = (name: string): boolean => grammar.has("surfaces", name) && !grammar.has("carriers", name);
       scores = this.kinds.completed(scores, splats, named, isSurface);

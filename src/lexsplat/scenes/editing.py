@@ -28,7 +28,8 @@ from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderErro
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.scenes.colors import parse_color
-from lexsplat.scenes.filling import Fill, fill_for
+from lexsplat.scenes.filling import fill_for
+from lexsplat.scenes.fills import Fill
 from lexsplat.scenes.folder import SceneFolder, refuse_within_scene
 from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.gone import gone_nouns

@@ -1,7 +1,7 @@
 """Fills the hole that a deleted thing leaves in the surface under it, which no photo shows.
 
 1. A thing stands on a surface (`lexsplat.scenes.surfaces`). The hole is the part of the surface that hardly any view
-   sees, because the thing hides it.
+   sees, because the thing hides it, alone or together with others.
 2. Gaussians of the reconstruction in the hole are deleted, because no photo shows them. So are those near the thing
    that show mostly without it: few pixels of the photos told their colors.
 3. The pattern of the surface is continued in the hole (`lexsplat.scenes.completing`), in an image from above. Each
@@ -16,12 +16,8 @@ Where no plane is found, such as below a hanging lamp, nothing is filled.
 
 from __future__ import annotations
 
-import base64
-import binascii
-import zlib
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -32,18 +28,20 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
-from lexsplat.geometry.gaussians import SH_C0, Gaussians
+from lexsplat.geometry.gaussians import SH_C0
 from lexsplat.geometry.hulls import GROWN, inside_hull
 from lexsplat.language.segments import Segments
 from lexsplat.queries.colors import cielab
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.completing import completed, light
+from lexsplat.scenes.fills import MOST, Fill
 from lexsplat.scenes.surfaces import (
     FEWEST,
     REACH,
     THICK,
     Orthophoto,
+    Surface,
     Views,
     covering,
     from_above,
@@ -57,6 +55,9 @@ Mask = NDArray[np.bool_]
 _FAINT = 0.1
 _HIDDEN = 0.88
 """Share of the views in which the thing hides a place, above which the Gaussians there are deleted."""
+_PARTLY = 0.3
+"""Share of the views in which the thing hides a place that no view sees, above which the place is filled, too: other
+things hide it in the rest. Hidden Gaussians there are deleted. From .15 to .5 the second scene gains the same."""
 _STUFFED = 0.5
 """Share of the views in which the thing hides a Gaussian within its hull, above which that is deleted too."""
 _REVEALED, _AROUND = 3.0, 1.3
@@ -78,123 +79,10 @@ _WAVES = 0.1
 """Largest height of waves of the surface, in radii of the foot: what is higher around it are things."""
 _ALIKE = 50.0
 """Difference of colors in CIELAB that is as far as a radius of the foot, where a fill takes its language."""
-_OPAQUE = 3.0
 _FLAT, _LARGE = 0.5, 0.25
 """A segment of which less is flat rises from the surface, unless it is this share of the scene, as a group is."""
-_COLUMNS = 13
-_BRIGHTEST = 100.0
 _LEAST_LIGHT = 0.01
 """Change of brightness below which a Gaussian stays as it is: nobody sees it, and a step lists each that changes."""
-_MOST = 1 << 20
-
-
-class Fill(NamedTuple):
-    """Gaussians that close a hole, and those around it that lose the shadow of a thing.
-
-    Args:
-        sources: The Gaussian whose language each takes ``[F]``.
-        disks: Means, rotations (wxyz), logarithms of sizes, and RGB ``[F, 13]`` float32.
-        lit: Gaussians of the scene that are brightened ``[L]``.
-        factors: By how much ``[L]`` float32.
-    """
-
-    sources: NDArray[np.int32]
-    disks: NDArray[np.float32]
-    lit: NDArray[np.int32] = np.zeros(0, "<i4")
-    factors: NDArray[np.float32] = np.zeros(0, "<f4")
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain data."""
-        return {
-            "gaussians": len(self.sources),
-            "disks": _packed(self.sources, self.disks),
-            "lit": len(self.lit),
-            "light": _packed(self.lit, self.factors),
-        }
-
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> Fill:
-        """The inverse of `to_json`; earlier versions brighten nothing.
-
-        Raises:
-            ValueError: If the data are not a fill.
-        """
-        try:
-            sources, disks = _unpacked(data["disks"], data["gaussians"], _COLUMNS)
-            if "lit" not in data:
-                return cls(sources, disks)
-            lit, factors = _unpacked(data["light"], data["lit"], 1)
-        except (KeyError, TypeError, binascii.Error, zlib.error) as error:
-            raise ValueError(f"not a fill: {error!r}") from error
-        return cls(sources, disks, lit, factors[:, 0])
-
-    def relit(self, scene: Gaussians) -> Gaussians:
-        """The scene with its brightened Gaussians; one that is listed twice takes the larger factor.
-
-        Raises:
-            ValueError: If a Gaussian is not in the scene, or a factor is not in 0..100.
-        """
-        if not len(self.lit):
-            return scene
-        if not 0 <= self.lit.min() <= self.lit.max() < len(scene):
-            raise ValueError("the fill is for another number of Gaussians")
-        if not ((self.factors > 0) & (self.factors <= _BRIGHTEST)).all():
-            raise ValueError(f"the fill brightens by a factor that is not in 0..{_BRIGHTEST:g}")
-        factors = np.zeros(len(scene), np.float32)
-        np.maximum.at(factors, self.lit, self.factors)
-        by = torch.from_numpy(np.where(factors > 0, factors, np.float32(1)))[:, None, None].to(scene.sh0)
-        unlit = (by == 1)[:, 0]
-        sh0 = ((scene.sh0 * SH_C0 + 0.5) * by - 0.5) / SH_C0
-        sh0[unlit] = scene.sh0[unlit]  # to the last bit
-        return replace(scene, sh0=sh0, shN=scene.shN * by)
-
-    def gaussians(self, scene: Gaussians) -> Gaussians:
-        """The Gaussians, with as many coefficients as those of a scene.
-
-        Raises:
-            ValueError: If a source is not in the scene, or a number is not finite or too large.
-        """
-        if len(self.sources) and not 0 <= self.sources.min() <= self.sources.max() < len(scene):
-            raise ValueError("the fill is for another number of Gaussians")
-        like = scene.select(torch.from_numpy(self.sources.astype(np.int64)).to(scene.device))
-        means, quats, sizes, colors = (
-            torch.from_numpy(self.disks.copy()).to(like.means).split([3, 4, 3, 3], 1)
-        )
-        found = replace(
-            like,
-            means=means.contiguous(),
-            quats=quats.contiguous(),
-            log_scales=sizes.contiguous(),
-            opacity_logits=torch.full_like(like.opacity_logits, _OPAQUE),
-            sh0=((colors - 0.5) / SH_C0)[:, None].contiguous(),
-            shN=torch.zeros_like(like.shN),
-        )
-        if found.find_invalid():
-            raise ValueError(f"the fill has {found.find_invalid()}")
-        return found
-
-
-def _packed(numbers: NDArray[np.int32], rows: NDArray[np.float32]) -> str:
-    """Integers ``[F]`` and rows ``[F]`` or ``[F, C]`` as text."""
-    raw = zlib.compress(numbers.tobytes() + rows.tobytes(), 6)
-    return base64.b64encode(raw).decode("ascii")
-
-
-def _unpacked(text: Any, count: Any, columns: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """The inverse of `_packed`.
-
-    Raises:
-        ValueError: If the text is not so many rows.
-    """
-    if type(count) is not int or not 0 <= count <= _MOST:
-        raise ValueError(f"not a fill of {count!r} Gaussians"[:100])
-    size = count * 4 * (1 + columns)
-    raw = zlib.decompressobj().decompress(base64.b64decode(text), size + 1)
-    if len(raw) != size:
-        raise ValueError(f"not a fill: {len(raw)} bytes for {count} Gaussians")
-    return np.frombuffer(raw, "<i4", count), np.frombuffer(raw, "<f4", offset=4 * count).reshape(
-        count, columns
-    )
 
 
 def fill_for(
@@ -229,16 +117,39 @@ def fill_for(
     mask = torch.from_numpy(gone).to(chosen.mask.device)
     if not found:
         return None, mask
-    return Fill(*(np.concatenate(rows)[:_MOST] for rows in zip(*found))), mask
+    return Fill(*(np.concatenate(rows)[:MOST] for rows in zip(*found))), mask
 
 
-def _fill_below(
-    thing: Selection, gone: Mask, shown: Mask, views: Views, segments: Segments | None
-) -> Fill | None:
-    """The Gaussians that close the surface under one thing; remains there are added to ``gone [N]``.
+class _Place(NamedTuple):
+    """A surface with a thing on it, in coordinates of the surface.
 
-    Those that are shown and stand on the thing are no remains: things on a cloth, on a table.
+    Args:
+        views: The scene and its views.
+        surface: The plane.
+        own: The Gaussians of the thing ``[N]``.
+        body: Those of them that are not faint ``[N]``.
+        solid: All that are not faint ``[N]``.
+        local: Means of all Gaussians: along the two axes, and above the plane ``[N, 3]``.
+        level: Those near the plane ``[N]``.
+        photo: The surface from above.
+        unseen: Its pixels that hardly any view sees, because the thing hides them ``[P, P]``.
+        unknown: Those that no view sees, because the thing and others hide them ``[P, P]``.
     """
+
+    views: Views
+    surface: Surface
+    own: Mask
+    body: Mask
+    solid: Mask
+    local: FloatArray
+    level: Mask
+    photo: Orthophoto
+    unseen: Mask
+    unknown: Mask
+
+
+def _place_of(thing: Selection, gone: Mask, views: Views) -> _Place | None:
+    """Where a thing stands; None if it stands on nothing."""
     gaussians = thing.gaussians
     means = gaussians.means.detach().cpu().double().numpy()
     own, solid = thing.mask.cpu().numpy(), gaussians.opacities.detach().cpu().numpy() >= _FAINT
@@ -246,24 +157,63 @@ def _fill_below(
     if surface is None:
         return None
     local = (means - surface.origin) @ surface.axes.T
-    flat = ~gone & solid & (np.abs(local[:, 2]) <= THICK * surface.radius)
-    photo = photographed(views, gone, surface, flat)
+    level = np.abs(local[:, 2]) <= THICK * surface.radius
+    photo = photographed(views, gone, surface, ~gone & solid & level)
     unseen = binary_dilation(photo.covered > _HIDDEN, iterations=_BORDER)
-    inside = _at(unseen, local[:, :2], photo) & (np.abs(local[:, 2]) <= THICK * surface.radius)
-    inside &= ~_standing(local, own & solid, inside & shown)
-    stuffing = _stuffing(views, own, gone | inside)
-    inside |= stuffing & ~_standing(local, own & solid, stuffing & shown)
-    revealed = _revealed(views, own, gone) & (local[:, 2] >= -THICK * surface.radius)
-    low, high = np.quantile(local[own & solid, 2], [0.02, 0.98])
-    if high - low < _SHEET * surface.radius:  # on a cloth stand things, whose bottoms no photo shows
-        revealed &= ~_standing(local, own & solid, revealed)
-    inside |= revealed
-    _, coverage, heights = from_above(gaussians, surface, flat & ~inside, photo.cells)
-    near = inside_hull(local[(own | revealed) & (local[:, 2] <= 2 * surface.radius), :2], photo.cells)
-    filled = binary_dilation(unseen, iterations=_OVERLAP)
-    hole = filled | ((near | binary_dilation(filled, iterations=_OVERLAP)) & (coverage < _BARE))
-    level = np.abs(heights) <= THICK * surface.radius
+    unknown = (photo.covered > _PARTLY) & (photo.shown <= 0)
+    return _Place(views, surface, own, own & solid, solid, local, level, photo, unseen, unknown)
+
+
+def _remains(place: _Place, gone: Mask, shown: Mask) -> tuple[Mask, Mask]:
+    """The Gaussians that go with a thing ``[N]``, and those of them that it only hid for the most part ``[N]``.
+
+    Those that are shown and stand on the thing are no remains: things on a cloth, on a table.
+    """
+    local, body, radius = place.local, place.body, place.surface.radius
+    inside = _at(place.unseen, local[:, :2], place.photo) & place.level
+    inside &= ~_standing(local, body, inside & shown)
+    inside |= _at(place.unknown, local[:, :2], place.photo) & place.level & ~shown
+    stuffing = _stuffing(place.views, place.own, gone | inside)
+    inside |= stuffing & ~_standing(local, body, stuffing & shown)
+    revealed = _revealed(place.views, place.own, gone) & (local[:, 2] >= -THICK * radius)
+    low, high = np.quantile(local[body, 2], [0.02, 0.98])
+    if high - low < _SHEET * radius:  # on a cloth stand things, whose bottoms no photo shows
+        revealed &= ~_standing(local, body, revealed)
+    return inside | revealed, revealed
+
+
+def _hole(place: _Place, flat: Mask, revealed: Mask) -> tuple[Mask, Mask, FloatArray]:
+    """The pixels to fill, those whose colors count, and the heights of all ``[P, P]``.
+
+    Args:
+        place: Where the thing stands.
+        flat: The Gaussians of the surface that stay ``[N]``.
+        revealed: See `_remains`.
+    """
+    local, radius, cells = place.local, place.surface.radius, place.photo.cells
+    _, coverage, heights = from_above(place.views.gaussians, place.surface, flat, cells)
+    near = inside_hull(local[(place.own | revealed) & (local[:, 2] <= 2 * radius), :2], cells)
+    filled = binary_dilation(place.unseen, iterations=_OVERLAP)
+    around = near | place.unknown | binary_dilation(filled, iterations=_OVERLAP)
+    hole = filled | (around & (coverage < _BARE))
+    level = np.abs(heights) <= THICK * radius
     known = (coverage >= _BARE) & level & ~binary_dilation(hole, iterations=_RIM)
+    return hole, known, heights
+
+
+def _fill_below(
+    thing: Selection, gone: Mask, shown: Mask, views: Views, segments: Segments | None
+) -> Fill | None:
+    """The Gaussians that close the surface under one thing; remains there are added to ``gone [N]``."""
+    place = _place_of(thing, gone, views)
+    if place is None:
+        return None
+    gaussians, surface, photo, local, solid = (
+        thing.gaussians, place.surface, place.photo, place.local, place.solid
+    )  # fmt: skip
+    flat = ~gone & solid & place.level
+    inside, revealed = _remains(place, gone, shown)
+    hole, known, heights = _hole(place, flat & ~inside, revealed)
     if not hole.any() or known.sum() < FEWEST:
         return None
     trust = known * (_UNSEEN + photo.shown)

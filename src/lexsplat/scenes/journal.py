@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lexsplat.runtime.errors import FileFormatError, SceneFolderError
 from lexsplat.runtime.files import naming
-from lexsplat.scenes.filling import Fill
+from lexsplat.scenes.fills import Fill
 from lexsplat.scenes.scene import Scene
 
 Kind = Literal["delete", "keep", "recolor", "move", "duplicate"]
@@ -48,7 +48,7 @@ class Step:
         kind: The operation.
         mask: The Gaussians it applies to ``[N]`` bool, of those that exist before the step.
         values: Its numbers: "color" and "strength", or "rotation" ``[3, 3]``, "scale", "translation", "center"; or
-            "fill", the Gaussians that close the hole (`lexsplat.scenes.filling.Fill.to_json`), and "remains", those
+            "fill", the Gaussians that close the hole (`lexsplat.scenes.fills.Fill.to_json`), and "remains", those
             that are deleted where a thing is moved away (`packed`).
         phrase: Phrase that was asked for, for display.
     """

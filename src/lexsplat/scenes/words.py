@@ -49,7 +49,7 @@ MEMBER = 0.9
 _PIECE = 0.3
 """Share of an object of its name from which a word is that object."""
 _MOSTLY = 0.7
-"""Share of an object of its noun from which a phrase with a color or another quality is that object."""
+"""Share of what views show of an object of its noun from which a phrase with a color or another quality is it."""
 _PER_THREAD = 100_000
 """Gaussians for each thread of torch: with fewer, waiting for each other costs more than it saves."""
 KEPT_GRAPHS, _KEPT_GRAPH = 16, 20_000
@@ -148,7 +148,7 @@ def completed(scene: Scene, prompt: str, word: Word) -> Word:
         return word
     taken, named = (word.scores >= BORDER) & ~scene.hidden, listed_under(scene, noun_of(prompt))
     if is_qualified(prompt):  # a yellow book is not the stack, but a gold ring is the ring
-        named = [each for each in named if each.phrase == prompt.lower() or _is_mostly(each, taken)]
+        named = [each for each in named if each.phrase == prompt.lower() or _is_mostly(scene, each, taken)]
     found = [
         each
         for each in named
@@ -163,9 +163,12 @@ def completed(scene: Scene, prompt: str, word: Word) -> Word:
     return replace(word, scores=scores)
 
 
-def _is_mostly(thing: Selection, taken: Tensor) -> bool:
-    """Whether a word takes nearly all of a thing."""
-    return int(taken[thing.indices].sum()) >= _MOSTLY * len(thing)
+def _is_mostly(scene: Scene, thing: Selection, taken: Tensor) -> bool:
+    """Whether a word takes nearly all that views show of a thing: a green bottle has a cork, too."""
+    segments = scene.field.segments
+    weights = thing.gaussians.opacities if segments is None else segments.masses
+    shown = weights[thing.indices]
+    return float((shown * taken[thing.indices]).sum()) >= _MOSTLY * float(shown.sum())
 
 
 def _is_scrap(other: Selection, taken: Tensor) -> bool:
