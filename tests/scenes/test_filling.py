@@ -372,7 +372,7 @@ def test_what_a_deleted_thing_and_others_hid_together_is_filled_and_what_only_ot
         side.ravel() for side in np.meshgrid(np.arange(0.34, 1.3, 0.02), np.arange(0, 0.4, 0.02))
     )
     plate = np.stack([across, np.full_like(across, 0.2), height], 1)  # beside the box, before both places
-    together, others = np.array([0.36, 0.6, 0]), np.array([1.0, 0.42, 0])
+    together, others = np.array([0.36, 0.6, 0]), np.array([0.75, 0.42, 0])
     apart = np.minimum(*(np.linalg.norm(means - place, axis=1) for place in (together, others)))
     kept = ~own & (apart > 0.1)
     points = np.concatenate([means[kept], plate, means[own]])

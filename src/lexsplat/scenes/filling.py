@@ -160,7 +160,7 @@ def _place_of(thing: Selection, gone: Mask, views: Views) -> _Place | None:
     level = np.abs(local[:, 2]) <= THICK * surface.radius
     photo = photographed(views, gone, surface, ~gone & solid & level)
     unseen = binary_dilation(photo.covered > _HIDDEN, iterations=_BORDER)
-    unknown = (photo.covered > _PARTLY) & (photo.shown <= 0)
+    unknown = (photo.revealed > _PARTLY) & (photo.shown <= 0)
     return _Place(views, surface, own, own & solid, solid, local, level, photo, unseen, unknown)
 
 

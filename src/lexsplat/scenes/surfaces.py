@@ -47,6 +47,8 @@ _VIEWS, _LONG_SIDE = 16, 240
 """Number and longer side of the views that are looked at."""
 _BEFORE = 0.2
 """Share of a pixel from which the thing in it hides what lies behind."""
+_EMPTY = 0.5
+"""Coverage of a pixel below which nothing is seen in it."""
 _PREPARED_BYTES = 2**28
 """Memory for prepared views, which are looked at several times."""
 
@@ -152,6 +154,26 @@ class Views:
             return view
         return replace(view, pairs=view.pairs.narrowed(view.pairs.tiles_at(pixels)))
 
+    def depth_without(self, number: int, gone: Mask, pixels: NDArray[np.int64]) -> FloatArray:
+        """Depth ``[H, W]`` in one of the small views without some Gaussians ``[N]``; infinite where nothing is left.
+
+        Only these pixels (x, y) ``[P, 2]`` are right.
+        """
+        gaussians, prepared = self.gaussians, self.prepared(number)
+        if isinstance(prepared.pairs, TilePairs):
+            pairs = prepared.pairs
+            prepared = replace(prepared, pairs=pairs.narrowed(pairs.tiles_at(pixels), gone))
+        else:
+            gaussians = gaussians.select(torch.from_numpy(~gone).to(gaussians.device))
+        same = prepared if gaussians is self.gaussians else None
+        with torch.no_grad():
+            view = render(gaussians, self.small[number], depth=True, prepared=same)
+        depth, alpha = (
+            cast(torch.Tensor, view.depth),
+            view.alpha.reshape(cast(torch.Tensor, view.depth).shape),
+        )
+        return torch.where(alpha < _EMPTY, torch.inf, depth).cpu().double().numpy()
+
     def weights(self, places: NDArray[np.int64], gone: Mask) -> tuple[FloatArray, FloatArray]:
         """Visible weights of some Gaussians ``[P]``, in pixels: now, and without others ``[N]``."""
         now, then = np.zeros(len(places)), np.zeros(len(places))
@@ -187,6 +209,7 @@ class Orthophoto(NamedTuple):
         colors: RGB ``[P, P, 3]``, divided by the coverage.
         shown: Share of the views that see the surface there ``[P, P]``.
         covered: Share of the views that have the thing before it ``[P, P]``.
+        revealed: Share of the views that have nothing but the thing before it ``[P, P]``.
     """
 
     cells: FloatArray
@@ -194,6 +217,7 @@ class Orthophoto(NamedTuple):
     colors: FloatArray
     shown: FloatArray
     covered: FloatArray
+    revealed: FloatArray
 
 
 def photographed(views: Views, gone: Mask, surface: Surface, members: Mask) -> Orthophoto:
@@ -208,21 +232,22 @@ def photographed(views: Views, gone: Mask, surface: Surface, members: Mask) -> O
     cells, size = _cells(surface, views.of)
     colors, coverage, _ = from_above(views.gaussians, surface, members, cells)
     places = (surface.origin + cells @ surface.axes[:2]).reshape(-1, 3)
-    shown, covered, seen = looked_up(views, gone, places, THICK * surface.radius)
-    shape = cells.shape[:2]
-    shown, covered, seen = shown.reshape(shape), covered.reshape(shape), seen.reshape(colors.shape)
+    *shares, seen = looked_up(views, gone, places, THICK * surface.radius)
+    shown, covered, revealed = (share.reshape(cells.shape[:2]) for share in shares)
+    seen = seen.reshape(colors.shape)
     known = (coverage > 0.5) & (shown > 0)
     width = surface.radius / size / 2
     gain = np.ones(3)
     if known.any():
         there, drawn = (mean_around(image, known.astype(float), width, 4.0) for image in (seen, colors))
         gain = (there / np.maximum(drawn, 0.02)).clip(0.5, 2)
-    return Orthophoto(cells, size, colors * gain, shown if views.of else np.ones_like(shown), covered)
+    shown = shown if views.of else np.ones_like(shown)
+    return Orthophoto(cells, size, colors * gain, shown, covered, revealed)
 
 
 def looked_up(
     views: Views, gone: Mask, places: FloatArray, slack: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Visibility and color of places ``[M, 3]`` in the views.
 
     Args:
@@ -233,16 +258,17 @@ def looked_up(
 
     Returns:
         The share of the views that see each place ``[M]``, the share that have the thing there or before it ``[M]``,
-        and the mean color of the former ``[M, 3]``, 0 without any.
+        the share that have nothing else before it ``[M]``, and the mean color of the first ``[M, 3]``, 0 without any.
     """
-    counts, shown, covered = (np.zeros(len(places)) for _ in range(3))
+    counts, shown, covered, revealed = (np.zeros(len(places)) for _ in range(4))
     colors = np.zeros((len(places), 3))
     thing = torch.from_numpy(gone)[:, None].to(views.gaussians.means)
     for number, camera in enumerate(views.small):
         found, depth, inside = camera.project(places)
         here = np.flatnonzero(inside)
-        looked = views.at(number, found[here].astype(int))
+        asked = found[here].astype(int)
         with torch.no_grad():
+            looked = views.at(number, asked)
             view = render(views.gaussians, camera, features=thing, depth=True, prepared=looked)
         nearest = cast(torch.Tensor, view.depth).cpu().numpy()
         pixels = tuple(found[here, ::-1].astype(int).T)
@@ -251,9 +277,13 @@ def looked_up(
         counts[here] += 1
         covered[here] += before
         shown[here] += there & ~before
+        if before.any():
+            left = views.depth_without(number, gone, asked[before])[tuple(asked[before, ::-1].T)]
+            revealed[here[before]] += left > depth[here[before]] - slack
         colors[here] += (there & ~before)[:, None] * view.image.cpu().double().numpy()[pixels]
     colors /= np.maximum(shown, 1)[:, None]
-    return shown / np.maximum(counts, 1), covered / np.maximum(counts, 1), colors
+    counts = np.maximum(counts, 1)
+    return shown / counts, covered / counts, revealed / counts, colors
 
 
 def covering(views: Views, gone: Mask, places: FloatArray) -> FloatArray:
