@@ -24,9 +24,8 @@ from lexsplat.language.fields import LanguageField
 from lexsplat.language.methods import JOINT_METHODS, METHODS, FitRun, MethodName, TrainingViews
 from lexsplat.language.methods.averaged import features_of_codes
 from lexsplat.pipeline.config import BuildConfig
+from lexsplat.pipeline.geometry import GeometryRun, joint_training
 from lexsplat.queries.relevancy import QueryForm
-from lexsplat.reconstruction import Reconstructor
-from lexsplat.reconstruction.few_photos import starting_points
 
 log = logging.getLogger("lexsplat")
 
@@ -217,13 +216,8 @@ def _trained_jointly(
     bench: Bench, config: BuildConfig, views: TrainingViews, run: FitRun
 ) -> tuple[Gaussians, LanguageField]:
     """Gaussians and language, trained together; the Gaussians start from the points and the seed of the bench's."""
-    seed, cache = bench.config.seed, bench.folder.root / "checkpoints" / "points"
-    points = starting_points(
-        bench.capture, seed=seed, cache_dir=cache, memory=run.memory, listener=run.listener
-    )
-    reconstructor = Reconstructor(
-        bench.capture, config.reconstruction, points, device=bench.device, seed=seed, memory=run.memory
-    )
-    training = JOINT_METHODS[config.method].joined(reconstructor, views, config, run.seed)
+    run = replace(run, seed=bench.config.seed)
+    geometry = GeometryRun(bench.capture, bench.folder, bench.device, run, key="", codes=lambda: views)
+    training = joint_training(JOINT_METHODS[config.method], config, geometry)
     training.run(run.listener, run.checkpoint)
     return training.result()

@@ -123,19 +123,27 @@ class _WithLanguage(Geometry):
         return self.method.geometry_outputs(checkpoints)
 
     def make(self, config: BuildConfig, run: GeometryRun) -> tuple[Gaussians, dict[str, Any]]:
-        points, memory = run.initial_points(), run.fit.memory
-        check_gaussians(config.reconstruction, run.device, memory)
-        start = (run.capture, config.reconstruction, points)
-        options: dict[str, Any] = {"device": run.device, "memory": memory}
-        views = run.codes()
-
-        def joined(reconstructor: Reconstructor) -> JointTrainer:
-            return self.method.joined(reconstructor, views, config, config.seed)
-
-        compile_kernels(run.device, run.fit.listener)
-        tell_time(*start, **options, listener=run.fit.listener, joined=joined)
-        training = joined(Reconstructor(*start, **options, seed=config.seed))
+        training = joint_training(self.method, config, run)
         return self.method.fit_geometry(training, run.fit), {"joint": True}
+
+
+def joint_training(method: JointMethod, config: BuildConfig, run: GeometryRun) -> JointTrainer:
+    """The training of geometry and language before its first step, after its time is told.
+
+    The seed of the geometry is that of ``run.fit``, the seed of the language that of ``config``.
+    """
+    points, memory = run.initial_points(), run.fit.memory
+    check_gaussians(config.reconstruction, run.device, memory)
+    start = (run.capture, config.reconstruction, points)
+    options: dict[str, Any] = {"device": run.device, "memory": memory}
+    views = run.codes()
+
+    def joined(reconstructor: Reconstructor) -> JointTrainer:
+        return method.joined(reconstructor, views, config, config.seed)
+
+    compile_kernels(run.device, run.fit.listener)
+    tell_time(*start, **options, listener=run.fit.listener, joined=joined)
+    return joined(Reconstructor(*start, **options, seed=run.fit.seed))
 
 
 @dataclass(frozen=True)
