@@ -30,7 +30,9 @@ def paper_folder(tiny_capture, tmp_path, monkeypatch) -> SceneFolder:
 
 @pytest.mark.slow
 def test_a_build_as_in_the_paper_trains_jointly_and_is_asked_with_a_fixed_threshold(paper_folder):
-    assert paper_folder.record["stages"]["reconstruct"]["joint"]
+    stage = paper_folder.record["stages"]["reconstruct"]
+    assert stage["joint"]
+    assert "9 training photos are few" in stage["warnings"][0], "as where language comes later"
     config = paper_folder.record["config"]
     assert (config["method"], config["features"]["mode"]) == ("trained", "random")
     assert not paper_folder.read_gaussians().antialiased

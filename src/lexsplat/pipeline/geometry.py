@@ -22,7 +22,7 @@ from lexsplat.pipeline.viewpoints import splats_of_capture
 from lexsplat.reconstruction import Reconstructor, check_gaussians, compile_kernels, reconstruct, tell_time
 from lexsplat.reconstruction.block_training import BlockRun, reconstruct_blocks
 from lexsplat.reconstruction.blocks import number_of_blocks
-from lexsplat.reconstruction.few_photos import starting_points
+from lexsplat.reconstruction.few_photos import has_few_photos, starting_points, warn_of_few_photos
 from lexsplat.runtime.progress import uncounted
 from lexsplat.scenes.folder import SceneFolder
 
@@ -124,7 +124,10 @@ class _WithLanguage(Geometry):
 
     def make(self, config: BuildConfig, run: GeometryRun) -> tuple[Gaussians, dict[str, Any]]:
         training = joint_training(self.method, config, run)
-        return self.method.fit_geometry(training, run.fit), {"joint": True}
+        gaussians = self.method.fit_geometry(training, run.fit)
+        if has_few_photos(run.capture):
+            warn_of_few_photos(run.capture, gaussians)
+        return gaussians, {"joint": True}
 
 
 def joint_training(method: JointMethod, config: BuildConfig, run: GeometryRun) -> JointTrainer:
