@@ -131,7 +131,7 @@ class _WithLanguage(Geometry):
 
 
 def joint_training(method: JointMethod, config: BuildConfig, run: GeometryRun) -> JointTrainer:
-    """The training of geometry and language before its first step, after its time is told.
+    """A training of geometry and language that is ready for its first step; logs how long it will take.
 
     The seed of the geometry is that of ``run.fit``, the seed of the language that of ``config``.
     """

@@ -62,7 +62,7 @@ class Fill(NamedTuple):
         return cls(sources, disks, lit, factors[:, 0])
 
     def relit(self, scene: Gaussians) -> Gaussians:
-        """The scene with its brightened Gaussians; one that is listed twice takes the larger factor.
+        """The scene without the shadow: Gaussians in ``lit`` are brightened, by the larger factor if listed twice.
 
         Raises:
             ValueError: If a Gaussian is not in the scene, or a factor is not in 0..100.

@@ -161,18 +161,16 @@ class Views:
         """
         gaussians, prepared = self.gaussians, self.prepared(number)
         if isinstance(prepared.pairs, TilePairs):
-            pairs = prepared.pairs
-            prepared = replace(prepared, pairs=pairs.narrowed(pairs.tiles_at(pixels), gone))
+            pairs = prepared.pairs.narrowed(prepared.pairs.tiles_at(pixels), gone)
+            view = replace(prepared, pairs=pairs)
         else:
             gaussians = gaussians.select(torch.from_numpy(~gone).to(gaussians.device))
-        same = prepared if gaussians is self.gaussians else None
+            view = prepare(gaussians, self.small[number])
         with torch.no_grad():
-            view = render(gaussians, self.small[number], depth=True, prepared=same)
-        depth, alpha = (
-            cast(torch.Tensor, view.depth),
-            view.alpha.reshape(cast(torch.Tensor, view.depth).shape),
-        )
-        return torch.where(alpha < _EMPTY, torch.inf, depth).cpu().double().numpy()
+            found = render(gaussians, self.small[number], color=False, depth=True, prepared=view)
+        depth = cast(torch.Tensor, found.depth)
+        empty = found.alpha.reshape(depth.shape) < _EMPTY
+        return torch.where(empty, torch.inf, depth).cpu().double().numpy()
 
     def weights(self, places: NDArray[np.int64], gone: Mask) -> tuple[FloatArray, FloatArray]:
         """Visible weights of some Gaussians ``[P]``, in pixels: now, and without others ``[N]``."""
