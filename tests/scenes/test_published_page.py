@@ -97,6 +97,18 @@ def test_the_demo_with_its_text_tower_has_at_most_8_megabytes(published_demo):
     assert sum(path.stat().st_size for path in published_demo.iterdir()) < 8e6
 
 
+def test_a_phrase_with_a_color_takes_what_python_takes_of_its_thing(page, demo):
+    script = f"""async () => {{
+        const app = await lexsplat.ready;
+        return ({BASE64})((await app.source.answer("green bottle", "#fff")).scores);
+    }}"""
+    taken = numbers(page.evaluate(script)) >= 0.5
+    expected = demo.ask("green bottle").scores[0].numpy() >= 0.5
+    assert (taken == expected).all()
+    bottle = next(each for each in demo.objects if each.phrase == "bottle")
+    assert taken[bottle.mask.numpy()].all(), "its cork, too, which is not green"
+
+
 def test_answers_are_those_of_python(page, demo):
     found = page.evaluate(
         """async (prompts) => {
