@@ -27,7 +27,12 @@ def test_nothing_lies_in_the_hull_of_few_or_flat_points(points):
     assert inside_hull(points, np.full((2, 3), 0.0)).tolist() == [False, False]
 
 
-@given(seed=st.integers(0, 1000), count=st.integers(5, 60), flat=st.booleans(), grown=st.sampled_from([1.0, 1.05, 2.0]))
+@given(
+    seed=st.integers(0, 1000),
+    count=st.integers(5, 60),
+    flat=st.booleans(),
+    grown=st.sampled_from([1.0, 1.05, 2.0]),
+)
 def test_the_hull_holds_what_a_triangulation_of_its_points_holds(seed, count, flat, grown):
     random = np.random.default_rng(seed)
     axes = 2 if flat else 3
@@ -41,4 +46,6 @@ def test_the_hull_holds_what_a_triangulation_of_its_points_holds(seed, count, fl
 def _corners(points):
     """Points that no other points surround: removed from a triangulation, they lie outside of it."""
     others = [np.delete(points, index, axis=0) for index in range(len(points))]
-    return points[[Delaunay(rest).find_simplex(point) < 0 for point, rest in zip(points, others, strict=True)]]
+    return points[
+        [Delaunay(rest).find_simplex(point) < 0 for point, rest in zip(points, others, strict=True)]
+    ]

@@ -57,20 +57,28 @@ class Frame:
 
 
 def frame_of(camera: Camera | None, up: NDArray[np.float64]) -> Frame:
-    """The frame of a viewer at a camera; arbitrary horizontal directions without one.
+    """The frame of a viewer at a camera; arbitrary horizontal directions without one."""
+    upwards = np.asarray(up, float) / np.linalg.norm(up)
+    if camera is None:
+        return Frame(*upright_frame(upwards))
+    (right,), (ahead,) = level_axes([camera], upwards)
+    return Frame(right, ahead, upwards)
+
+
+def level_axes(
+    cameras: Sequence[Camera], up: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The horizontal directions right and ahead of viewers at cameras ``[V, 3]`` each, for a unit vector ``up [3]``.
 
     A camera that looks straight down has no horizontal view direction: "ahead" is then the top of its image.
     """
-    upwards = np.asarray(up, float) / np.linalg.norm(up)
-    if camera is None:
-        right, ahead, upwards = upright_frame(upwards)
-        return Frame(right, ahead, upwards)
-    ahead = camera.forward - (camera.forward @ upwards) * upwards
-    if np.linalg.norm(ahead) < 0.2:
-        top = -camera.viewmat[1, :3]
-        ahead = top - (top @ upwards) * upwards
-    ahead = ahead / np.linalg.norm(ahead)
-    return Frame(np.cross(ahead, upwards), ahead, upwards)
+    turns = np.array([camera.viewmat[:3, :3] for camera in cameras]).reshape(-1, 3, 3)
+    forwards, tops = turns[:, 2] / np.linalg.norm(turns[:, 2], axis=1, keepdims=True), -turns[:, 1]
+    level, level_tops = (each - np.outer(each @ up, up) for each in (forwards, tops))
+    steep = np.linalg.norm(level, axis=1, keepdims=True) < 0.2
+    ahead = np.where(steep, level_tops, level)
+    ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
+    return np.cross(ahead, up), ahead
 
 
 def holds(relation: RelationName, target: Selection, reference: Selection, frame: Frame) -> bool:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lexsplat.geometry.cameras import Camera
 from lexsplat.queries.phrases import RelationName
-from lexsplat.queries.relations import CONE, REACH, Frame, frame_of
+from lexsplat.queries.relations import CONE, REACH, Frame, frame_of, level_axes
 from lexsplat.queries.selection import Selection
 
 DIRECTED: tuple[RelationName, ...] = ("left of", "right of", "in front of", "behind")
@@ -59,7 +59,7 @@ class Viewers:
             weights = np.where(answers + 1 == totals.argmax(), weights, 0.0)
         best = int(weights.argmax())
         self._taken.append(self._names[best])
-        return self._frames[best]
+        return frame_of(self.like.cameras[self._names[best]], self.like.up.direction)
 
     @property
     def seen_from(self) -> str:
@@ -82,14 +82,10 @@ class Viewers:
         return seen.names if seen is not None and seen.complete else list(self.like.cameras)
 
     @cached_property
-    def _frames(self) -> list[Frame]:
-        return [frame_of(self.like.cameras[name], self.like.up.direction) for name in self._names]
-
-    @cached_property
     def _axes(self) -> NDArray[np.float64]:
         """The axis to the right of each view, or ahead of it ``[V, 3]``."""
-        sideways = self.relation in ("left of", "right of")
-        return np.array([frame.right if sideways else frame.ahead for frame in self._frames])
+        right, ahead = level_axes([self.like.cameras[name] for name in self._names], self.like.up.direction)
+        return right if self.relation in ("left of", "right of") else ahead
 
     def _shares(self, one: Selection) -> NDArray[np.float64]:
         """The share of each view that a thing covers ``[V]``; 1 or 0 where no rendering of the views is kept."""
