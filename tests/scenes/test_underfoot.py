@@ -8,7 +8,7 @@ from lexsplat.geometry.gaussians import gaussians_from_points
 from lexsplat.queries.selection import Selection
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.scene import open_scene
-from lexsplat.scenes.underfoot import underfoot
+from lexsplat.scenes.underfoot import Ground, underfoot
 
 WOOD, GOLD, WHITE = (0.62, 0.37, 0.23), (0.7, 0.45, 0.02), (0.95, 0.95, 0.95)
 
@@ -28,7 +28,8 @@ def ring_on_a_table(inside=WOOD, height=0.0, tube=0.07, table=2000):
     gaussians = gaussians_from_points(points, colors.clip(0, 1), sh_degree=0, opacity=0.9)
     labels = torch.from_numpy(labels)
     thing = Selection(gaussians, {}, labels > 0, torch.ones(len(points)))
-    return thing, labels == 0, labels
+    ground = Ground(gaussians, labels == 0, thing.up.direction)
+    return thing, ground.around(thing), labels
 
 
 @pytest.mark.parametrize("tube", [0.05, 0.07, 0.1])

@@ -37,7 +37,7 @@ from lexsplat.scenes.answers import find_best_views, rests_on
 from lexsplat.scenes.facts import NO_SEGMENTS
 from lexsplat.scenes.pixels import object_colors, shown_weights
 from lexsplat.scenes.sheet import write_sheet
-from lexsplat.scenes.underfoot import underfoot
+from lexsplat.scenes.underfoot import Ground, underfoot
 
 if TYPE_CHECKING:
     from lexsplat.language.segment_codes import SegmentCodes
@@ -142,9 +142,10 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     for number in known[surfaces].tolist():
         pieces = _with_pieces_apart(scene, named == number, pieces, things)
     found: list[Selection] = []
-    carriers = [number for number in known.tolist() if words[number] in CARRIERS]
+    carriers = torch.tensor([number for number in known.tolist() if words[number] in CARRIERS]).to(named)
     # Objects share no Gaussian, so they share scores. Surfaces come last: pieces of things leave them.
     scores, shown = torch.zeros_like(segments.masses), ~scene.hidden
+    ground = Ground(scene.gaussians, shown & (segments.masses >= _SEEN), scene.world.up.direction)
     for done, number in enumerate([*known[~surfaces].tolist(), *known[surfaces].tolist()]):
         scene.listener(Event("objects", done, len(known)))
         mask, name = named == number, words[number]
@@ -152,7 +153,7 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
         for each in [both] if name in STUFF else _instances(both, mask):
             named[each.indices] = number
             if name not in SURFACES:
-                each = _without_surface(scene, each, named, carriers)
+                each = _without_surface(each, named, ground, carriers, segments.labels)
             each = each.within(shown)
             if (
                 each and float(scene.gaussians.opacities[each.indices].mean()) >= FAINT
@@ -210,26 +211,26 @@ def _with_pieces_apart(
     return found
 
 
-def _without_surface(scene: Scene, thing: Selection, named: torch.Tensor, carriers: list[int]) -> Selection:
+def _without_surface(
+    thing: Selection, named: torch.Tensor, ground: Ground, carriers: torch.Tensor, labels: torch.Tensor
+) -> Selection:
     """The thing without its segments that are the surface it stands on; they are named as that surface.
 
     Args:
-        scene: The scene.
         thing: The thing.
         named: The word of each Gaussian ``[N]``; changed.
+        ground: What may show a surface.
         carriers: Words of the surfaces that carry things.
+        labels: The lowest segment of each Gaussian ``[N]``.
     """
-    segments = scene.field.segments
-    if segments is None:
-        return thing
-    surfaces = torch.isin(named, torch.tensor(carriers, device=named.device))
-    surfaces &= ~scene.hidden & (segments.masses >= _SEEN)
-    back = underfoot(thing, surfaces, segments.labels)
+    surface = ground.around(thing)
+    surface = surface[torch.isin(named[surface], carriers)]
+    back = underfoot(thing, surface, labels)
     if not len(back):
         return thing
-    means, places = thing.gaussians.means.detach(), surfaces.nonzero()[:, 0]
-    _, nearest = cKDTree(means[places].cpu().numpy()).query(means[back].cpu().numpy())
-    named[back] = named[places[torch.from_numpy(nearest).to(places.device)]]
+    means = thing.gaussians.means.detach()
+    _, nearest = cKDTree(means[surface].cpu().numpy()).query(means[back].cpu().numpy())
+    named[back] = named[surface[torch.from_numpy(nearest).to(surface.device)]]
     kept = thing.mask.clone()
     kept[back] = False
     return thing.within(kept)

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.queries.colors import cielab
 from lexsplat.queries.selection import FAINT, Selection
 from lexsplat.scenes.formats.tables import colors_of
@@ -23,7 +24,7 @@ _RANK = 5
 _FEWEST = 16
 """Fewest Gaussians that rise from the surface; a thing with fewer is a sheet that lies on it."""
 _REACH = 2.5
-"""Radii of a thing around its center in which the surface is looked at."""
+"""Radii of a thing around its center in which the surface is looked at; up and down it is one."""
 _ROWS = 8192
 """Gaussians whose neighbors' colors are in memory at once."""
 _LEVEL = 0.9
@@ -38,32 +39,51 @@ All are chosen on the second bundled scene, where a pale saucer on wood stays wi
 FloatArray = NDArray[np.float64]
 
 
-def underfoot(thing: Selection, surfaces: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+class Ground:
+    """Visible Gaussians of a scene by where they are from above: those near a thing are found in little time.
+
+    Args:
+        gaussians: The N Gaussians of the scene.
+        shown: Which of them may show a surface ``[N]`` bool.
+        up: World direction ``[3]``.
+    """
+
+    def __init__(self, gaussians: Gaussians, shown: torch.Tensor, up: FloatArray) -> None:
+        self.indices = (shown & (gaussians.opacities.detach() >= FAINT)).nonzero()[:, 0]
+        means = gaussians.means.detach()[self.indices].cpu().double().numpy()
+        self._across, self._heights = _upright(means, up)
+        self._tree = cKDTree(self._across, balanced_tree=False, compact_nodes=False)
+
+    def around(self, thing: Selection) -> torch.Tensor:
+        """Indices of the Gaussians at the foot of a thing ``[S]``, ascending; none at a thing of few Gaussians."""
+        if len(thing) <= _FEWEST or not len(self.indices):
+            return self.indices[:0]
+        across, heights = _upright(thing.points[0], thing.up.direction)
+        middle, radius = across.mean(0), float(np.ptp(across, axis=0).max()) / 2
+        reach = _REACH * radius
+        near = np.sort(np.asarray(self._tree.query_ball_point(middle, reach, p=np.inf), np.intp))
+        beside = np.abs(self._across[near] - middle).max(1, initial=0.0) < reach
+        level = np.abs(self._heights[near] - np.quantile(heights, 0.02)) < radius
+        return self.indices[torch.from_numpy(near[beside & level]).to(self.indices.device)]
+
+
+def underfoot(thing: Selection, surface: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
     """The Gaussians of a thing whose segments are the surface around it.
 
     Args:
         thing: The thing.
-        surfaces: Which Gaussians are visible ones of surfaces that carry things ``[N]`` bool.
+        surface: Indices of Gaussians at its foot (`Ground.around`) that are of surfaces that carry things ``[S]``.
         labels: The lowest segment of each Gaussian ``[N]``.
 
     Returns:
         Their indices ``[B]``.
     """
     nothing = thing.indices[:0]
-    if len(thing) <= _FEWEST:
+    if len(surface) < _NEIGHBORS or len(thing) <= _FEWEST:
         return nothing
     across, heights = _upright(thing.points[0], thing.up.direction)
-    middle, radius = across.mean(0), float(np.ptp(across, axis=0).max()) / 2
-    near = surfaces & (thing.gaussians.opacities.detach() >= FAINT)
-    places = near.nonzero()[:, 0]
-    means = thing.gaussians.means.detach()[places].cpu().double().numpy()
+    means = thing.gaussians.means.detach()[surface].cpu().double().numpy()
     level, floor = _upright(means, thing.up.direction)
-    close = (np.abs(level - middle).max(1) < _REACH * radius) & (
-        np.abs(floor - np.quantile(heights, 0.02)) < radius
-    )
-    places, level, floor = places[torch.from_numpy(close).to(places.device)], level[close], floor[close]
-    if len(places) < _NEIGHBORS:
-        return nothing
     around = cKDTree(level)
     beside = around.query(across, k=_NEIGHBORS)[1]
     raised = heights - np.median(floor[beside], 1)
@@ -72,7 +92,7 @@ def underfoot(thing: Selection, surfaces: torch.Tensor, labels: torch.Tensor) ->
     body = np.flatnonzero(raised > 2 * thick)
     if len(body) < _FEWEST:
         return nothing
-    own, theirs = (_cielab(thing, index) for index in (thing.indices, places))
+    own, theirs = (_cielab(thing, index) for index in (thing.indices, surface))
     points = thing.points[0]
     nearest = body[cKDTree(points[body]).query(points, k=min(_NEIGHBORS, len(body)))[1]]
     unlike_surface, unlike_thing = _difference(own, theirs, beside), _difference(own, own, nearest)
