@@ -100,13 +100,18 @@ def test_the_demo_with_its_text_tower_has_at_most_8_megabytes(published_demo):
 def test_a_phrase_with_a_color_takes_what_python_takes_of_its_thing(page, demo):
     script = f"""async () => {{
         const app = await lexsplat.ready;
-        return ({BASE64})((await app.source.answer("green bottle", "#fff")).scores);
+        const answer = await app.source.answer("green bottle", "#fff");
+        const scores = ({BASE64})(answer.scores);
+        await app.source.refine(answer);
+        return [scores, answer.places.map((place) => place.splats.length)];
     }}"""
-    taken = numbers(page.evaluate(script)) >= 0.5
+    scores, marked = page.evaluate(script)
+    taken = numbers(scores) >= 0.5
     expected = demo.ask("green bottle").scores[0].numpy() >= 0.5
     assert (taken == expected).all()
     bottle = next(each for each in demo.objects if each.phrase == "bottle")
     assert taken[bottle.mask.numpy()].all(), "its cork, too, which is not green"
+    assert marked == [pytest.approx(len(demo.find("green bottle")), rel=0.01)], "faint splats, but no specks"
 
 
 def test_answers_are_those_of_python(page, demo):

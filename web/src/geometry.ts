@@ -194,7 +194,7 @@ export class Geometry {
 
   /**
    * Splats that are linked: nearer than 2.5 times the usual distance to the sixth neighbor. Faint splats, and of large
-   * selections those that are not in a sample, join the cluster of a linked one nearby.
+   * selections those that are not in a sample, join the cluster of a near one.
    */
   #clusters(chosen: number[]): number[][] {
     const firm = chosen.filter((i) => this.opacities[i] >= this.rule.faint);
@@ -215,15 +215,12 @@ export class Geometry {
       return top;
     };
     for (const i of makers) grid.near(i, (j) => j < i && parents.set(root(i), root(j)) && false);
-    const clusters = new Map<number, number[]>();
-    for (const i of chosen) {
-      let own: number | null = parents.has(i) ? i : null;
-      if (own === null) grid.near(i, (j) => (own = j) !== null);
-      if (own === null) continue;
-      const top = root(own);
-      const cluster = clusters.get(top);
-      if (cluster) cluster.push(i);
-      else clusters.set(top, [i]);
+    const clusters = new Map<number, number[]>(makers.map((i) => [root(i), []]));
+    for (const i of makers) clusters.get(root(i))!.push(i);
+    let apart = chosen.filter((i) => !parents.has(i));
+    for (let reach = link; apart.length > 0 && reach < Infinity; reach = Math.max(4 * reach, 1e-6)) {
+      const wider = reach === link ? grid : new Grid(this.centers, makers, reach);
+      apart = apart.filter((i) => !wider.near(i, (j) => clusters.get(root(j))!.push(i) > 0));
     }
     return [...clusters.values()];
   }
@@ -303,13 +300,14 @@ export class Grid {
     }
   }
 
-  /** Visit the splats within one side of a splat, until `visit` is true. */
-  near(splat: number, visit: (other: number) => boolean): void {
+  /** Visit the splats within one side of a splat, until `visit` is true; whether it was. */
+  near(splat: number, visit: (other: number) => boolean): boolean {
     const limit = this.side * this.side;
     for (let n = 0; n < 27; n++) {
       const cell = this.#cells.get(this.#key(splat, (n % 3) - 1, (Math.floor(n / 3) % 3) - 1, Math.floor(n / 9) - 1));
-      for (const other of cell ?? []) if (squared(this.centers, splat, other) <= limit && visit(other)) return;
+      for (const other of cell ?? []) if (squared(this.centers, splat, other) <= limit && visit(other)) return true;
     }
+    return false;
   }
 
   /** A number for each cube within 2^16 sides of the origin; cubes farther away share numbers. */
