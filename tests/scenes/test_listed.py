@@ -14,7 +14,7 @@ from lexsplat.queries.vocabulary import default_vocabulary
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.listed import listed_as, refuse_doubtful
-from lexsplat.scenes.objects import objects_of
+from lexsplat.scenes.objects import objects_of, with_pieces_apart
 from lexsplat.scenes.scene import Scene, open_scene
 from lexsplat.scenes.words import of_color_told
 
@@ -185,6 +185,17 @@ def test_a_thing_with_a_part_is_found_as_a_whole(demo, phrase, name):
 def test_what_stands_before_a_surface_and_shows_it_belongs_to_its_thing(demo, name, height):
     """The neck of the bottle shows the wall, and the stand of the lamp the table."""
     assert listed(demo, name).size[2] == pytest.approx(height, abs=0.05)
+
+
+@pytest.mark.parametrize(("share", "joins"), [(0.45, True), (0.2, False)])
+def test_a_piece_before_a_wall_joins_a_thing_that_much_of_it_is_like(demo, share, joins):
+    """Another build takes more than half of the neck for nothing else than wall."""
+    bottle, wall = (listed(demo, name) for name in ("bottle", "wall"))
+    neck = bottle.mask & (demo.gaussians.means[:, 2] > 0.6)
+    like = neck & (torch.rand(len(neck), generator=torch.Generator().manual_seed(0)) < share)
+    nothing = torch.full_like(neck, -1, dtype=torch.long)
+    pieces = with_pieces_apart(demo, wall.mask | neck, nothing, torch.where(like, 7, nothing))
+    assert float((pieces[neck] == 7).float().mean()) == pytest.approx(float(joins), abs=0.05)
 
 
 @pytest.mark.slow

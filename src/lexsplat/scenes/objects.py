@@ -51,8 +51,9 @@ _NAMES = 3
 _LEAST_PROBABILITY = 0.01
 _SEEN = 1.0
 """Pixels of all views from which a Gaussian of a surface tells its height and color."""
-_MOST = 0.5
-"""Share of a piece that lies apart from its surface, by opacity, which one thing's name must describe."""
+_MOST = 0.35
+"""Share of a piece that lies apart from its surface, by opacity, which one thing's name must describe; on the second
+bundled scene pieces have less than 0.1 or more than 0.5."""
 _FAR_BETTER = 0.5
 """Share of the likeliest name's probability below which an object's own name gives way to it."""
 
@@ -140,7 +141,7 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
         torch.from_numpy(each).to(segments.labels)[segments.labels] for each in (numbers, others, likeliest)
     )
     for number in known[surfaces].tolist():
-        pieces = _with_pieces_apart(scene, named == number, pieces, things)
+        pieces = with_pieces_apart(scene, named == number, pieces, things)
     found: list[Selection] = []
     carriers = torch.tensor([number for number in known.tolist() if words[number] in CARRIERS]).to(named)
     # Objects share no Gaussian, so they share scores. Surfaces come last: pieces of things leave them.
@@ -182,7 +183,7 @@ def _whole_segments(
     return with_surfaces(whole, codes.masses, surfaces, strengths)
 
 
-def _with_pieces_apart(
+def with_pieces_apart(
     scene: Scene, surface: torch.Tensor, pieces: torch.Tensor, things: torch.Tensor
 ) -> torch.Tensor:
     """The pieces of things ``[N]`` with what lies apart from a surface, off its plane, and is most like one thing.
@@ -205,9 +206,10 @@ def _with_pieces_apart(
     apart = ~level_with(chosen.selected, labels, int(weights.argmax()))
     for label in np.flatnonzero(apart & (weights < SMALLEST_SHARE * weights.max())):
         own = labels == label
-        shares = np.bincount(like[own] + 1, opacities[own])
-        if shares.argmax() > 0 and shares.max() > _MOST * shares.sum():
-            found[chosen.indices[torch.from_numpy(own).to(chosen.indices.device)]] = int(shares.argmax()) - 1
+        of_things = like[own] >= 0
+        shares = np.bincount(like[own][of_things], opacities[own][of_things])
+        if len(shares) and shares.max() > _MOST * opacities[own].sum():
+            found[chosen.indices[torch.from_numpy(own).to(chosen.indices.device)]] = int(shares.argmax())
     return found
 
 
