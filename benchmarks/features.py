@@ -145,7 +145,7 @@ def cases() -> Iterator[Case]:
         with pretrained.precision(images.device, crops=True):
             return vision(images, patches=True)
 
-    yield Case("ViT-B/16", encode, SIDE, FeatureConfig.sparse(vision.patches))
+    yield Case("ViT-B/16", encode, SIDE, FeatureConfig.suited(vision.patches))
 
 
 def timed(function: Callable[[], object]) -> tuple[float, float]:

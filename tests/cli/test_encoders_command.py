@@ -128,7 +128,7 @@ def test_towers_of_different_sizes_and_blind_towers_are_refused(monkeypatch):
 def test_the_estimate_counts_the_crops_that_extraction_encodes(tiny_capture, tmp_path):
     from lexsplat.features import extract_features
 
-    clip, config = load_clip("bundled"), FeatureConfig.sparse()
+    clip, config = load_clip("bundled"), FeatureConfig.suited()
     capture, encoded = load_capture(tiny_capture), []
     capture = dataclasses.replace(capture, views=dict(itertools.islice(capture.views.items(), 2)))
     inner = clip.encode_images
@@ -141,7 +141,7 @@ def test_the_estimate_counts_the_crops_that_extraction_encodes(tiny_capture, tmp
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_the_estimate_is_of_as_many_photos_at_once_as_the_extraction_takes(threads, monkeypatch):
-    clip, config, ticks, seen = load_clip("bundled"), FeatureConfig.sparse(), itertools.count(), []
+    clip, config, ticks, seen = load_clip("bundled"), FeatureConfig.suited(), itertools.count(), []
     inner = clip.encode_images
     monkeypatch.setattr(
         clip, "encode_images", lambda crops: seen.append(torch.get_num_threads()) or inner(crops)

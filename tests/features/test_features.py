@@ -353,11 +353,11 @@ def test_the_sparse_settings_take_a_sixth_of_the_crops():
     def crops(config):
         return sum(map(len, grid_levels(1297, 840, config.crop_sizes, config.crop_strides)))
 
-    assert crops(FeatureConfig.sparse()) * 6 <= crops(FeatureConfig())
+    assert crops(FeatureConfig.suited()) * 6 <= crops(FeatureConfig())
     photo = grid_levels(
-        1440, 1080, FeatureConfig.sparse(14).crop_sizes, FeatureConfig.sparse(14).crop_strides
+        1440, 1080, FeatureConfig.suited(14).crop_sizes, FeatureConfig.suited(14).crop_strides
     )
-    before = grid_levels(1440, 1080, FeatureConfig.sparse().crop_sizes, FeatureConfig.sparse().crop_strides)
+    before = grid_levels(1440, 1080, FeatureConfig.suited().crop_sizes, FeatureConfig.suited().crop_strides)
     assert sum(map(len, photo)) * 5 <= sum(map(len, before)), "patches are read from a fifth of these at most"
 
 
@@ -372,7 +372,7 @@ def test_a_cpu_finds_what_is_six_percent_of_the_photo(tmp_path):
     masked = np.asarray(Image.open(root / "segmentations/view_002/bear_nose.png").convert("L")) > 127
     assert np.ptp(np.nonzero(masked)[0]) < 0.06 * len(masked)
     view = load_capture(root).views[name]
-    settings = FeatureConfig.sparse(clip.patches)
+    settings = FeatureConfig.suited(clip.patches)
     maps = extract_features(SimpleNamespace(views={name: view}), clip, None, settings, cache_dir=tmp_path)
     relevancy = (maps[name].clip @ clip.encode_text(["bear nose"]).T)[..., 0]
     row, column = divmod(int(relevancy.argmax()), relevancy.shape[1])

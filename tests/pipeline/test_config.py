@@ -67,11 +67,11 @@ def _folder_of(path, kind, **vision):
     return str(path)
 
 
-def test_features_on_a_cpu_suit_the_patches_of_the_encoder(tmp_path):
-    def features(clip, **changes):
+def test_features_suit_the_patches_of_the_encoder(tmp_path):
+    def features(clip, device="cpu", **changes):
         config = BuildConfig(clip=clip, features=FeatureConfig(**changes))
-        resolved = config.resolved("cpu", (10, 10))
-        assert resolved.resolved("cpu", (10, 10)) == resolved
+        resolved = config.resolved(device, (10, 10))
+        assert device == "cuda" or resolved.resolved(device, (10, 10)) == resolved
         return resolved.features
 
     base = _folder_of(
@@ -79,19 +79,22 @@ def test_features_on_a_cpu_suit_the_patches_of_the_encoder(tmp_path):
     )  # transformers leaves out the default of 224 pixels
     assert features(base).crop_sizes == pytest.approx((0.36,))
     assert features(base).tokens == "both"
+    assert features(base, "cuda") == replace(features(base), dino_stride=FeatureConfig.dino_stride)
+    assert features(base, "cuda", crop_tokens="class") == FeatureConfig(crop_tokens="class")
     small = features(_folder_of(tmp_path / "b32", "clip", image_size=224, patch_size=32))
     assert small.crop_sizes == pytest.approx((0.18,)), "a patch covers as much of the photo as with B/16"
     large = features(_folder_of(tmp_path / "l336", "clip", image_size=336, patch_size=14))
     assert large.crop_sizes == (0.5,)
     other = features(_folder_of(tmp_path / "siglip", "siglip", image_size=224, patch_size=16))
-    assert other == FeatureConfig.sparse()
+    assert other == FeatureConfig.suited()
     assert other.tokens == "class"
-    assert features(base, crop_tokens="class") == replace(FeatureConfig.sparse(), crop_tokens="class")
-    assert features(base, mode="random") == replace(FeatureConfig.sparse(), mode="random")
-    assert features(str(tmp_path / "nothing")) == FeatureConfig.sparse()
+    assert features(str(tmp_path / "siglip"), "cuda") == FeatureConfig()
+    assert features(base, crop_tokens="class") == replace(FeatureConfig.suited(), crop_tokens="class")
+    assert features(base, mode="random") == replace(FeatureConfig.suited(), mode="random")
+    assert features(str(tmp_path / "nothing")) == FeatureConfig.suited()
 
 
-@pytest.mark.parametrize(("clip", "suited"), [("bundled", "bundled"), ("some/clip", "sparse")])
+@pytest.mark.parametrize(("clip", "suited"), [("bundled", "bundled"), ("some/clip", "suited")])
 def test_one_given_feature_setting_leaves_the_others_as_they_suit(clip, suited):
     suited = getattr(FeatureConfig, suited)()
     random = {"mode": "random", "crop_tokens": None}  # random crops have no patch tokens
@@ -167,7 +170,7 @@ def test_averaging_takes_dino_for_class_tokens_and_not_for_patches():
     assert not used(clip="bundled", features=classes, averaged=AveragedConfig(dino=False))
     assert not used(clip="bundled", features=classes, dino="none")
     assert not used(clip="bundled", features=classes, features_from=Path("features"))
-    assert BuildConfig().resolved("cuda", (10, 10)).uses_dino, "a GPU reads CLIP at class tokens"
+    assert used(clip="some/siglip"), "no patches are known of it"
 
 
 def test_result_settings_keep_those_of_the_chosen_method_only():

@@ -16,12 +16,12 @@ RANDOM_SETTINGS = ("random_crops", "random_levels", "random_sizes", "seed")
 """Settings of mode "random"."""
 
 PATCH_SIDE = 0.36 / 14
-"""Side of a patch as a fraction of the photo's short side, where a CPU reads large encoders at their patches."""
+"""Side of a patch as a fraction of the photo's short side, where large encoders are read at their patches."""
 
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """Settings of feature extraction. The defaults suit CLIP ViT-B/16 and DINO ViT-S/8 on a GPU.
+    """Settings of feature extraction. The defaults suit class tokens and DINO ViT-S/8 on a GPU; see `suited`.
 
     Args:
         mode: "grid": a regular grid of crops for each size, as in LERF and the authors' code. "random": the paper's
@@ -30,8 +30,8 @@ class FeatureConfig:
         crop_strides: Grid: distance between crops of each size, as a fraction of their side.
         crop_tokens: Grid: which embeddings of a crop are used. "class": the image-level embedding, placed at the
             center of the crop (the paper). "patch": patch-level embeddings as in MaskCLIP, each placed at its patch;
-            needs a model of CLIP's own architecture. "both": both. None is "class"; it is "both" for the bundled
-            encoders, and on a CPU for models of CLIP's architecture.
+            needs a model of CLIP's own architecture. "both": both. None is "class"; a build takes "both" for such
+            models.
         random_crops: Random: crops per view, divided evenly among the sizes.
         random_levels: Random: number of sizes.
         random_sizes: Random: smallest and largest side as fractions of the image's short side.
@@ -100,8 +100,8 @@ class FeatureConfig:
         return self.crop_tokens or "class"
 
     @classmethod
-    def sparse(cls, patches: int = 0) -> FeatureConfig:
-        """Settings for large encoders on a CPU: fewer crops, and a quarter of DINO's work.
+    def suited(cls, patches: int = 0, *, sparse: bool = True) -> FeatureConfig:
+        """Settings for large encoders.
 
         An encoder with patch-level embeddings reads few large crops at their patches, too: 24 of a 4:3 photo for
         14x14 patches. A patch covers `PATCH_SIDE` of the photo, so finer grids of patches take larger crops, up to
@@ -110,11 +110,15 @@ class FeatureConfig:
         Args:
             patches: Patches along a side of the encoder's input (`lexsplat.features.clip.patch_grid`); 0 if it has no
                 patch-level embeddings.
+            sparse: For a CPU: fewer crops of encoders without patches, and a quarter of DINO's work.
         """
-        if not patches:
-            return cls(crop_sizes=(0.2, 0.4), crop_strides=(0.5, 0.5), map_cells=56, dino_stride=4)
-        size = min(0.5, max(patches, 6) * PATCH_SIDE)
-        return cls(crop_sizes=(size,), crop_strides=(0.6,), crop_tokens="both", dino_stride=4)
+        stride = 4 if sparse else cls.dino_stride
+        if patches:
+            size = min(0.5, max(patches, 6) * PATCH_SIDE)
+            return cls(crop_sizes=(size,), crop_strides=(0.6,), crop_tokens="both", dino_stride=stride)
+        if sparse:
+            return cls(crop_sizes=(0.2, 0.4), crop_strides=(0.5, 0.5), map_cells=56, dino_stride=stride)
+        return cls()
 
     @classmethod
     def bundled(cls) -> FeatureConfig:

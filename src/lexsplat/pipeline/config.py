@@ -239,10 +239,10 @@ class BuildConfig:
         features = self.features
         if self.clip == "bundled":
             features = features.on_top_of(FeatureConfig.bundled())
-        elif encoder_device != "cuda":
+        else:
             reads_patches = features.mode == "grid" and features.crop_tokens != "class"
             patches = patch_grid(self.clip) if reads_patches else 0
-            features = features.on_top_of(FeatureConfig.sparse(patches))
+            features = features.on_top_of(FeatureConfig.suited(patches, sparse=encoder_device != "cuda"))
         averaged = self.averaged
         if averaged.dino is None:
             with_dino = features.tokens == "class" and self.dino != "none" and self.features_from is None
