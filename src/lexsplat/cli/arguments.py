@@ -19,6 +19,7 @@ import dataclasses
 import functools
 import inspect
 import io
+import operator
 import re
 import shutil
 import sys
@@ -99,6 +100,7 @@ def parse(command: type[CommandT], name: str, words: Sequence[str]) -> CommandT:
         _print_help(command, program, _not_essential(command))
     try:
         parsed = _parsed(command, program, words)
+        _refuse_replaced(getattr(parsed, "settings", None), words)
         if hasattr(parsed, "check"):
             parsed.check()
         return parsed
@@ -124,6 +126,29 @@ def _parsed(command: type[CommandT], program: str, words: Sequence[str]) -> Comm
         if not sys.stderr.isatty():  # tyro asks standard output
             text = re.sub(r"\x1b\[[\d;]*m", "", text)
         print(text, end="", file=sys.stderr)
+
+
+def _refuse_replaced(settings: Any, words: Sequence[str]) -> None:
+    """Refuse given settings in whose place ``--as-in-paper`` takes others.
+
+    The settings themselves take a value that equals its default for one that was not given.
+
+    Raises:
+        ValueError: If there is one.
+    """
+    if not getattr(settings, "as_in_paper", False):
+        return
+    taken = settings.spelled_out()
+    for option in (word.partition("=")[0] for word in words if word.startswith("--")):
+        *parts, name = option.removeprefix("--").replace("-", "_").split(".")
+        path = operator.attrgetter(".".join((*parts, name.removeprefix("no_"))))
+        with contextlib.suppress(AttributeError):  # an option of the command, not of the settings
+            found, expected = path(settings), path(taken)
+            if found != expected:
+                raise ValueError(
+                    f"{option}: expected {expected}, for which --as-in-paper stands, found {found}; "
+                    f"leave {option} or --as-in-paper out"
+                )
 
 
 def _without_code_marks(line: re.Match[str]) -> str:
