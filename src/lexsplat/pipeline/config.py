@@ -79,7 +79,8 @@ class BuildConfig:
         views_from: From where splats without a capture are looked at: from "inside" a room, or from "around" an
             object; by default what they seem to be.
         method: "averaged" puts the features of views on each Gaussian and quantizes them there (the best in
-            docs/results.md); "trained" is the optimization of the paper.
+            docs/results.md); "trained" optimizes the paper's losses. Without ``joint``, the geometry is finished
+            first.
         joint: Train language together with geometry, as in the paper; needs method "trained".
         as_in_paper: Build and ask as the paper describes it (docs/paper.md): method "trained", jointly, 30,000 steps
             over full maps, random crops, rasterization without the mip filter, prompts relative to canonical phrases

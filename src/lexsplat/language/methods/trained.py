@@ -1,4 +1,8 @@
-"""Method "trained", the paper's: Eq. 8 to 15 (section 3.4), one random training view a step, geometry frozen."""
+"""Method "trained": the paper's losses, Eq. 8 to 15 (section 3.4), on one random training view a step.
+
+The geometry is finished first and frozen. With ``--joint``, both are trained together as in the paper
+(`lexsplat.language.methods.joint`).
+"""
 
 from __future__ import annotations
 
