@@ -13,7 +13,11 @@ from support.written_captures import save
 
 from lexsplat.captures import poses_from_photos
 from lexsplat.captures.sfm.feature_budget import check_space
-from lexsplat.runtime.errors import CaptureError
+from lexsplat.pipeline.build import build
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.runtime.errors import CaptureError, MemoryBudgetError
+
+CONFIG = BuildConfig(clip="bundled", dino="none", device="cpu")
 
 
 @pytest.fixture
@@ -34,7 +38,35 @@ def test_a_disk_without_room_for_the_features_is_reported_before_the_work(photos
     with pytest.raises(CaptureError) as caught:
         poses_from_photos(photos, tmp_path / "model")
     assert "MB of free space for the features of 3 photos, found 0.3 MB; free some space" in str(caught.value)
+    assert "--poses.max-features (lexsplat poses: --max-features)" in str(caught.value)
     assert not list((tmp_path / "model").rglob("database.db"))
+
+
+def test_a_build_without_room_for_the_features_leaves_no_folder(photos, tmp_path, monkeypatch):
+    with_free(monkeypatch, 300_000)
+    with pytest.raises(CaptureError, match=r"--poses\.max-features"):
+        build(photos, tmp_path / "new" / "scene", CONFIG)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_build_without_memory_for_the_features_leaves_no_folder(photos, tmp_path, monkeypatch):
+    def too_little(*_, **__) -> int:
+        raise MemoryBudgetError("structure from motion", expected="more", found="less", remedy="give more")
+
+    monkeypatch.setattr("lexsplat.captures.sfm.mapping.extraction_threads", too_little)
+    with pytest.raises(MemoryBudgetError):
+        build(photos, tmp_path / "new" / "scene", CONFIG)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_build_that_ends_later_keeps_its_features(photos, tmp_path, monkeypatch):
+    def full(database: Path, memory: int) -> None:
+        raise CaptureError(database, expected="room", found="none", remedy="make some")
+
+    monkeypatch.setattr("lexsplat.captures.sfm.photos.check_mapping", full)
+    with pytest.raises(CaptureError, match="make some"):
+        build(photos, tmp_path / "scene", CONFIG)
+    assert (tmp_path / "scene" / "poses" / ".poses" / "database.db").exists()
 
 
 @pytest.mark.parametrize(

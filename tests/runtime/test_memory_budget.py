@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -226,8 +227,8 @@ def one_line(error: MemoryBudgetError, *words: str) -> None:
 def test_photos_whose_features_do_not_fit_are_refused_with_a_size_that_does():
     with pytest.raises(MemoryBudgetError) as caught:
         feature_budget.extraction_threads((1600, 1200), 1600, 2000, 200 * MEGABYTE)
-    one_line(caught.value, "photos of 1600x1200 pixels", "a max-side of ")
-    side = int(str(caught.value).rsplit(" ", 1)[1])
+    one_line(caught.value, "photos of 1600x1200 pixels", "or --poses.max-side ")
+    side = int(re.search(r"--poses.max-side (\d+)", str(caught.value))[1])
     assert feature_budget.extraction_threads((1600, 1200), side, 2000, 200 * MEGABYTE) == 1
     needed = int(str(caught.value).split("use --memory ")[1].split("MB")[0])
     assert feature_budget.extraction_threads((1600, 1200), 1600, 2000, needed * MEGABYTE) == 1
@@ -257,7 +258,7 @@ def test_matches_and_models_that_do_not_fit_are_refused(tmp_path):
     assert 10 <= held <= 400 * MEGABYTE // (8000 * budget.FEATURE_BYTES)
     with pytest.raises(MemoryBudgetError) as caught:
         feature_budget.matching_plan(database, 100 * MEGABYTE, least=60)
-    one_line(caught.value, "8,000 features", "max-features of ")
+    one_line(caught.value, "8,000 features", "or --poses.max-features ")
     feature_budget.check_mapping(database, 2 << 30)
     with pytest.raises(MemoryBudgetError) as caught:
         feature_budget.check_mapping(database, 300 * MEGABYTE)

@@ -234,7 +234,9 @@ class SceneFolder:
             keep_root: Leave the empty folder, because it was there before.
         """
         files = [path for path in self.root.rglob("*") if not path.is_dir()]
-        begun = {self.root / name for name in (".lock", "scene.json", "cameras.json")}
+        begun = {
+            self.root / name for name in (".lock", "scene.json", "cameras.json", "poses/.poses/source.txt")
+        }
         if self.record["stages"] or not set(files) <= begun:
             return
         for path in files:

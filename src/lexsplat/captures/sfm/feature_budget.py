@@ -44,7 +44,7 @@ def extraction_threads(
     need = {threads: need_of(max_side, threads) for threads in range(1, _cores() + 1)}
     sides = range(min(max_side, max(photo)), 63, -32)
     fitting = next((side for side in sides if need_of(side, 1) <= memory), None)
-    remedy = "scale the photos down first" if fitting is None else f"a max-side of {fitting}"
+    remedy = "scale the photos down first" if fitting is None else _option("max-side", fitting)
     budget.require(_STAGE, need[1], memory, f"features of photos of {photo[0]}x{photo[1]} pixels", remedy)
     return budget.most_within(memory, need)
 
@@ -71,7 +71,8 @@ def check_space(database: Path, photos: int, size: tuple[int, int], max_side: in
             database.parent,
             expected=f"{need / 1e6:,.1f} MB of free space for the features of {photos:,} photos",
             found=f"{free / 1e6:,.1f} MB",
-            remedy="free some space there and run the same command again, or give a smaller max-features",
+            remedy="free some space there and run the same command again, "
+            f"or give a smaller {_option('max-features')}",
         )
 
 
@@ -92,7 +93,8 @@ def matching_plan(
     least = min(least, max(2, photos))
     need = budget.matching_bytes(most, least, 1)
     fewer = max(100, most * memory // max(need, 1) // 100 * 100)
-    budget.require(_STAGE, need, memory, f"matching photos of {most:,} features", f"max-features of {fewer}")
+    what, remedy = f"matching photos of {most:,} features", _option("max-features", fewer)
+    budget.require(_STAGE, need, memory, what, remedy)
     threads = budget.most_within(
         memory, {count: budget.matching_bytes(most, least, count) for count in range(1, _cores() + 1)}
     )
@@ -111,7 +113,7 @@ def check_mapping(database: Path, memory: int) -> None:
     _, features, photos, matches = _counts(database)
     need = budget.mapping_bytes(features, matches)
     what = f"{photos:,} photos with {features:,} features and {matches:,} matches"
-    budget.require(_STAGE, need, memory, what, "fewer photos, or smaller max-features")
+    budget.require(_STAGE, need, memory, what, f"fewer photos, or a smaller {_option('max-features')}")
 
 
 def _counts(database: Path) -> tuple[int, int, int, int]:
@@ -122,6 +124,11 @@ def _counts(database: Path) -> tuple[int, int, int, int]:
         ).fetchone()
         (matches,) = connection.execute("SELECT COALESCE(SUM(rows), 0) FROM two_view_geometries").fetchone()
     return int(most), int(features), int(photos), int(matches)
+
+
+def _option(name: str, value: int | None = None) -> str:
+    """The option of a setting of structure from motion, with a value: that of ``build``, and of ``poses``."""
+    return f"--poses.{name}{'' if value is None else f' {value}'} (lexsplat poses: --{name})"
 
 
 def _cores() -> int:

@@ -110,6 +110,8 @@ def extract_features(
         MemoryBudgetError: If ``memory`` is too little for photos of this size.
     """
     check_space(database, len(photos.names), photos.largest, config.max_side, config.max_features)
+    masked = photos.masks is not None
+    threads = extraction_threads(photos.largest, config.max_side, config.max_features, memory, masked=masked)
     pycolmap.Database.open(database).close()
     reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
     if photos.masks is not None:
@@ -117,8 +119,6 @@ def extract_features(
     for group in photos.lenses:
         # Importing first assigns image ids in order; extraction alone assigns them as threads finish.
         pycolmap.import_images(database, photos.images, pycolmap.CameraMode.SINGLE, list(group), reader)
-    masked = photos.masks is not None
-    threads = extraction_threads(photos.largest, config.max_side, config.max_features, memory, masked=masked)
     options = pycolmap.FeatureExtractionOptions(max_image_size=config.max_side, num_threads=threads)
     options.sift.max_num_features = config.max_features
     size = batch_size(len(photos.names), threads)
