@@ -1,5 +1,6 @@
 import math
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from lexsplat.evaluation import metrics
+from lexsplat.runtime.progress import NOTE
 
 MASKS = arrays(bool, (5, 7))
 # Few distinct values, so that ties are common.
@@ -76,6 +78,33 @@ def test_without_torchvision_lpips_is_refused_before_torchmetrics_loads(monkeypa
     assert function is None
     assert "torchvision" in reason
     assert not any(name.partition(".")[0] == "torchmetrics" for name in sys.modules)
+
+
+@pytest.mark.parametrize("there", [False, True], ids=["missing", "downloaded"])
+def test_size_license_and_place_of_the_weights_of_lpips_are_told_before_they_are_downloaded(
+    there, tmp_path, monkeypatch, caplog
+):
+    told_before = []
+
+    class Network(torch.nn.Module):
+        def __init__(self, **_) -> None:
+            super().__init__()
+            told_before.extend(caplog.messages)  # where torchvision downloads the weights
+
+    weights = SimpleNamespace(url="https://a.org/models/vgg16-0123.pth", meta={"_file_size": 527.796})
+    models = SimpleNamespace(VGG16_Weights=SimpleNamespace(DEFAULT=weights))
+    monkeypatch.setitem(sys.modules, "torchvision", SimpleNamespace(models=models))
+    lpip = SimpleNamespace(LearnedPerceptualImagePatchSimilarity=Network)
+    monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", lpip)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    folder = tmp_path / "hub" / "checkpoints"
+    if there:
+        folder.mkdir(parents=True)
+        (folder / "vgg16-0123.pth").write_bytes(b"weights")
+    with caplog.at_level(NOTE, logger="lexsplat"):
+        assert metrics.load_lpips()[1] is None
+    told = f"VGG-16 of torchvision, for LPIPS: 528 MB are downloaded once to {folder}; license: BSD-3-Clause"
+    assert [line.partition(" (")[0] for line in told_before] == ([] if there else [told])
 
 
 # Relevancy maps, strict protocol

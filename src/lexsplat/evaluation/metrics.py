@@ -9,13 +9,20 @@ precision at the recalls 0, 0.01, ..., 1 (COCO), so it lies in 0..1. The protoco
 from __future__ import annotations
 
 import importlib
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
+
+from lexsplat.runtime.progress import NOTE
+
+log = logging.getLogger("lexsplat")
 
 RECALLS: NDArray[np.float64] = np.arange(101) / 100
 """The 101 recall points. Divided rather than accumulated, so that a recall of exactly 29 in 100 reaches point 29."""
@@ -66,14 +73,17 @@ Perceptual = Callable[[ArrayLike, ArrayLike], float]
 def load_lpips(device: str = "cpu") -> tuple[Perceptual | None, str | None]:
     """LPIPS (VGG) of torchmetrics: the function and None, or None and the reason why it is unavailable.
 
-    The metric needs the extra ``lexsplat[lpips]`` and the weights of VGG-16, which are downloaded once.
+    The metric needs the extra ``lexsplat[lpips]`` and the weights of VGG-16, which are downloaded once. Their size
+    and license are logged first.
     """
     try:
         import torch
 
-        importlib.import_module("torchvision")  # LPIPS needs it, and torchmetrics takes seconds to load
+        # LPIPS needs it, and torchmetrics takes seconds to load.
+        torchvision = importlib.import_module("torchvision")
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
+        _tell_download(torchvision.models.VGG16_Weights.DEFAULT)
         network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to(device).eval()
     except ImportError as error:
         return None, f"not installed: pip install 'lexsplat[lpips]' ({_first_line(error)})"
@@ -92,6 +102,21 @@ def load_lpips(device: str = "cpu") -> tuple[Perceptual | None, str | None]:
         return value
 
     return distance, None
+
+
+def _tell_download(weights: Any) -> None:
+    """Log size, place and license of torchvision's weights of VGG-16, unless they are on this machine."""
+    import torch
+
+    path = Path(torch.hub.get_dir()) / "checkpoints" / weights.url.rpartition("/")[2]
+    if not path.exists():
+        log.log(
+            NOTE,
+            "VGG-16 of torchvision, for LPIPS: %.0f MB are downloaded once to %s; license: BSD-3-Clause "
+            "(trained on ImageNet, which has terms of its own)",
+            weights.meta.get("_file_size", 528),
+            path.parent,
+        )
 
 
 # Relevancy maps, strict protocol
