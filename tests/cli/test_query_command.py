@@ -63,6 +63,11 @@ def test_query_writes_the_features_of_a_view(built, tmp_path, capsys):
     schema = Path(__file__).resolve().parents[2] / "docs" / "schemas" / "query.json"
     assert not list(Draft202012Validator(json.loads(schema.read_text())).iter_errors(answer))
     assert Image.open(answer["features"]["view_02.png"]["picture"]).size == (96, 72)
+    assert cli.main(arguments) == 0
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        f"images in {tmp_path}",
+        f"features, and their colors, in {tmp_path / 'features'}",
+    ]
     with pytest.raises(SystemExit):
         cli.main([*arguments, "--no-images"])
     assert "leave --no-images out" in capsys.readouterr().err

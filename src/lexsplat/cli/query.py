@@ -120,3 +120,5 @@ class Query:
         print_rests_on(scene, answers["rests_on"])
         if folder:
             print(f"images in {folder}")
+            if self.features:
+                print(f"features, and their colors, in {folder / 'features'}")
