@@ -182,12 +182,12 @@ def test_splats_of_another_place_are_refused_and_those_of_the_place_taken(tmp_pa
 
 
 def test_a_gpu_without_a_compiler_is_reported_before_anything_is_written(photos, tmp_path, monkeypatch):
-    def without_extension():
-        raise BackendError("gsplat", expected="its extension", found="none", remedy="use --device cpu")
+    def without_extension(instead):
+        raise BackendError("gsplat", expected="its extension", found="none", remedy=f"use {instead}")
 
     monkeypatch.setattr(pipeline, "choose_device", lambda wanted: "cuda")
     monkeypatch.setattr(pipeline, "require_gsplat", without_extension)
-    refused(photos, tmp_path / "out", "--device cpu", kind=BackendError)
+    refused(photos, tmp_path / "out", "--device cpu --encoder-device cuda", kind=BackendError)
 
 
 def test_an_encoder_device_that_is_missing_is_reported_before_anything_is_written(

@@ -10,6 +10,7 @@ from lexsplat.evaluation.scenes import evaluate_scene
 from lexsplat.language.methods import MethodName
 from lexsplat.pipeline.build import build
 from lexsplat.pipeline.config import BuildConfig
+from lexsplat.rendering.backends import choose_rasterizer
 from lexsplat.runtime.progress import Listener, silent
 from lexsplat.scenes.scene import open_scene
 
@@ -43,7 +44,7 @@ def run_demo(
         output: Scene folder to make or to resume.
         capture: Name of the bundled capture.
         method: Method of the language; None takes the default.
-        device: Device to compute on.
+        device: Device to compute on (`choose_rasterizer`).
         seed: Seed of all randomness.
         iterations: Reconstruction steps; None takes what suits the device.
         listener: Receives progress events.
@@ -51,9 +52,8 @@ def run_demo(
     Returns:
         The content of ``metrics.json``.
     """
-    config = replace(
-        DEMO_CONFIG, method=method or DEMO_CONFIG.method, device=device, seed=seed, iterations=iterations
-    )
+    method, device = method or DEMO_CONFIG.method, choose_rasterizer(device)
+    config = replace(DEMO_CONFIG, method=method, device=device, seed=seed, iterations=iterations)
     build(demo_capture(capture), output, config, listener=listener)
     opened = open_scene(output, device=device)
     return evaluate_scene(opened, title="lexsplat demo", listener=listener)

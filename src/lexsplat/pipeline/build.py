@@ -109,7 +109,7 @@ def build(
     device = choose_device(config.device)
     config = replace(config, encoder_device=choose_encoder_device(config.encoder_device, device))  # type: ignore[arg-type]
     if device == "cuda":
-        require_gsplat()  # before anything that takes time
+        require_gsplat("--device cpu --encoder-device cuda")  # before anything that takes time
     folder = _output_folder(source, Path(output))
     existed = folder.root.exists()
     is_new = not existed or not any(folder.root.iterdir())

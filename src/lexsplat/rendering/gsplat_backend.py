@@ -54,8 +54,11 @@ class TileLists:
         return sum(t.numel() * t.element_size() for t in (self.offsets, self.members))
 
 
-def require_gsplat() -> None:
+def require_gsplat(instead: str = "--device cpu") -> None:
     """Load gsplat with its CUDA extension.
+
+    Args:
+        instead: Options of the command with which it runs without gsplat, for the error.
 
     Raises:
         BackendError: If it is not installed, or has no extension and no compiler to build it with.
@@ -64,7 +67,7 @@ def require_gsplat() -> None:
         import gsplat  # noqa: F401
     except ImportError as error:
         raise BackendError(
-            "gsplat", found=str(error), remedy="run: pip install gsplat==1.5.3; or use --device cpu"
+            "gsplat", found=str(error), remedy=f"run: pip install gsplat==1.5.3; or use {instead}"
         ) from error
     found = "an installation without one"
     # The import may compile the extension and print to standard output, which carries our JSON.
@@ -81,7 +84,7 @@ def require_gsplat() -> None:
             expected="its CUDA extension",
             found=found,
             remedy="install a wheel built for this torch and CUDA, or put nvcc and a C++ compiler on the PATH, or "
-            "rasterize on the CPU: --device cpu --encoder-device cuda",
+            f"rasterize on the CPU: {instead}",
         )
 
 

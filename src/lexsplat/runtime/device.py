@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator
 from contextvars import ContextVar
 from functools import partial
+from typing import Literal
 
 import torch
 
@@ -55,7 +56,7 @@ def kernel_threads() -> int:
     return _kernel_threads.get() or torch.get_num_threads()
 
 
-def choose_device(wanted: str) -> str:
+def choose_device(wanted: str) -> Literal["cpu", "cuda"]:
     """Resolve "auto", "cpu" or "cuda" to "cpu" or "cuda".
 
     Raises:

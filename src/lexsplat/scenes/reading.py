@@ -11,6 +11,7 @@ from lexsplat.features.text import check_encoder
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField, field_from_tensors
 from lexsplat.queries.relevancy import QueryConfig
+from lexsplat.rendering.backends import choose_rasterizer
 from lexsplat.runtime.errors import FileFormatError, SceneFolderError
 from lexsplat.runtime.files import read_tensors
 from lexsplat.scenes.folder import SceneFolder
@@ -59,11 +60,17 @@ class SceneContent:
 def read_scene(path: Path, device: str) -> SceneContent:
     """The scene in a folder, or its previous version while it is being rebuilt.
 
+    Args:
+        path: The folder.
+        device: "auto", "cpu" or "cuda" (`choose_rasterizer`).
+
     Raises:
+        BackendError: If "cuda" is asked for and cannot be used.
+        ValueError: If the device is not one of the three.
         SceneFolderError: If there is neither, or builds change it faster than it is read.
         FileFormatError: If a file is damaged.
     """
-    attempts = 0
+    device, attempts = choose_rasterizer(device), 0
     while True:
         folder = SceneFolder.open(path)
         attempts += 1

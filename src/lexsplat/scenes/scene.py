@@ -47,7 +47,7 @@ from lexsplat.queries.thresholds import check_threshold
 from lexsplat.queries.vocabulary import thing_of_part
 from lexsplat.rendering import Rendering, render
 from lexsplat.runtime.bounded import Bounded
-from lexsplat.runtime.device import choose_device, kernel_threads, torch_threads
+from lexsplat.runtime.device import kernel_threads, torch_threads
 from lexsplat.runtime.errors import SceneFolderError
 from lexsplat.runtime.lazy import at_first_call
 from lexsplat.runtime.progress import Listener, silent
@@ -433,18 +433,18 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
 
     Args:
         path: A folder made by ``lexsplat build`` or ``lexsplat demo``, or the word ``demo`` for the bundled scene.
-        device: "auto", "cpu" or "cuda".
+        device: "cpu", "cuda", or "auto": CUDA where there is a GPU that gsplat renders on.
         clip: Name or folder of the text encoder, if it is not where the build found it; it is checked at once.
 
     Raises:
         SceneFolderError: If the folder is not a finished scene.
         ModelError: If ``clip`` cannot be found, or is not the encoder of the build.
         FileFormatError: If one of its files is damaged.
-        BackendError: If "cuda" is asked for and there is no CUDA device.
+        BackendError: If "cuda" is asked for and cannot be used.
         ValueError: If the device is not one of the three.
     """
     if not isinstance(path, (str, os.PathLike)):
         expected = "the path of a scene folder"
         raise SceneFolderError(repr(path)[:60], expected=expected, found=type(path).__name__)
-    found = read_scene(Path(path), choose_device(device))
+    found = read_scene(Path(path), device)
     return Scene(found.gaussians, found.field, found.views, found.encoder(clip), found.query, found.folder)

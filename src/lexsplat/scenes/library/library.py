@@ -68,7 +68,7 @@ class Library:
     """
 
     def __init__(self, root: str | Path, device: str = "auto", index: str | None = None) -> None:
-        self.root, self._device = Path(root), choose_device(device)
+        self.root, self._device, self._text_device = Path(root), device, choose_device(device)
         self.stage = self.root / "scenes"
         """The folder of the entries."""
         name = identity.library_name(self.root)
@@ -255,7 +255,7 @@ class Library:
 
     def _tower(self, clip: str) -> TextTower:
         if clip not in self._towers:
-            self._towers[clip] = load_text(clip, self._device)
+            self._towers[clip] = load_text(clip, self._text_device)
         return self._towers[clip]
 
     def embed(self, content_hash: str, clip: str, texts: list[str]) -> Tensor:
