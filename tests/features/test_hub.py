@@ -275,3 +275,14 @@ def test_a_file_is_refused_with_its_folder_and_a_path_that_is_not_there_without_
             ModelError, match="expected a model folder, or a name OWNER/NAME, found no such folder"
         ):
             hub.model_folder(str(name), "dino")
+
+
+def test_a_repository_with_pickled_shards_alone_is_refused_by_their_name(fake):
+    for name in [name for name in fake.files if "model" in name]:
+        del fake.files[name]
+    fake.files["pytorch_model.bin.index.json"] = 100
+    with pytest.raises(
+        ModelError, match=r"open_clip_pytorch_model.bin, found pytorch_model\.bin\.index\.json;"
+    ):
+        hub.model_folder("owner/name", "clip")
+    assert not fake.fetched

@@ -172,6 +172,18 @@ def test_shards_load_whole_and_every_shard_is_needed(clip_folder, clip_copy):
 # -- what is refused
 
 
+def test_pickled_shards_are_named_and_how_to_write_safetensors_of_them(clip_copy):
+    (clip_copy / "model.safetensors").unlink()
+    for number in range(1, 9):
+        (clip_copy / f"a-{number}.bin").write_bytes(b"")
+    (clip_copy / "pytorch_model.bin.index.json").write_text("{}")
+    refused(
+        clip_copy,
+        "expected a model folder with model.safetensors, found pytorch_model.bin.index.json",
+        f"AutoModel.from_pretrained({str(clip_copy)!r}).save_pretrained({str(clip_copy)!r})",
+    )
+
+
 def test_a_model_saved_without_its_tokenizer_is_refused(clip_copy):
     for name in TOKENIZER:
         (clip_copy / name).unlink()

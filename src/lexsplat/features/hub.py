@@ -18,7 +18,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from lexsplat.features.weights import INDEX, WEIGHTS, first_weights, read_config, weight_files
+from lexsplat.features.weights import INDEX, PICKLED_INDEX, WEIGHTS, first_weights, read_config, weight_files
 from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.files import free_bytes, write_file
 from lexsplat.runtime.fingerprints import blocks, digest
@@ -87,11 +87,12 @@ def model_folder(name: str, tower: str) -> Path:
         if lacking:
             if "tokenizer" in lacking:
                 _check_has_text(folder, name)
+            pickled = lacking == "model.safetensors" and (folder / PICKLED_INDEX).is_file()
             raise ModelError(
                 name,
                 expected=f"a model folder with {lacking}",
-                found=_contents(folder),
-                remedy=_remedy_for(lacking, name, tower),
+                found=f"{PICKLED_INDEX}, whose shards are pickles" if pickled else _contents(folder),
+                remedy=_remedy_of_pickles(name) if pickled else _remedy_for(lacking, name, tower),
             )
         for path in loaded_files(folder, tower):
             _check_readable(path)
@@ -247,6 +248,13 @@ def _remedy_for(lacking: str, name: str, tower: str) -> str:
     return f"give a folder written by save_pretrained, a model name, or {other}"
 
 
+def _remedy_of_pickles(name: str) -> str:
+    """How to write safetensors of pickled shards."""
+    place = repr(str(Path(name).expanduser()))
+    written = f"AutoModel.from_pretrained({place}).save_pretrained({place})"
+    return f"write it in Python: from transformers import AutoModel; {written}"
+
+
 # -- the hub
 
 
@@ -325,7 +333,7 @@ def _check_complete(name: str, tower: str, names: Collection[str], wanted: Colle
     if "config.json" not in wanted:
         others = "config.json of transformers", "a repository of another library"
     elif not set(WEIGHTS) & set(wanted):
-        others = f"one of {', '.join(WEIGHTS)}", "none of them"
+        others = f"one of {', '.join(WEIGHTS)}", PICKLED_INDEX if PICKLED_INDEX in names else "none of them"
     elif tower == "clip" and not set(_VOCABULARIES) & set(names):
         others = "a tokenizer", "none in its repository"
     else:

@@ -27,6 +27,8 @@ WEIGHTS = (
     "open_clip_pytorch_model.bin",
 )
 """Files of weights; the first that exists is read. The index lists the shards of large models."""
+PICKLED_INDEX = "pytorch_model.bin.index.json"
+"""The list of shards that are pickles, which are not read."""
 
 _CLIP_NAMES = (
     (r"^visual\.class_embedding$", "vision_model.embeddings.class_embedding"),
