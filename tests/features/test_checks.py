@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
-from lexsplat.features.checks import CAPTURE, PLACES, WORDS, bundled_images
+from lexsplat.captures import load_capture
+from lexsplat.features.checks import CAPTURE, ENOUGH, PLACES, WORDS, bundled_images, check_words, rank_words
+from lexsplat.features.encoders import load_clip
+from lexsplat.pipeline.config import BuildConfig
+from lexsplat.pipeline.encoding import Encoders, check_given
+from lexsplat.runtime.errors import ModelError
 
 
 @pytest.mark.parametrize("word", WORDS)
@@ -29,3 +37,34 @@ def test_an_image_of_one_word_is_that_among_all():
     images = bundled_images(48)
     assert images.shape == (len(WORDS), 3, 48, 48)
     assert bundled_images(48, WORDS[3:5]).equal(images[3:5])
+
+
+def rotation(size: int) -> torch.Tensor:
+    return torch.linalg.qr(torch.randn(size, size, generator=torch.Generator().manual_seed(1)))[0]
+
+
+def test_patches_without_content_are_found_where_class_tokens_are_right(monkeypatch):
+    clip = load_clip("bundled")
+    assert rank_words(clip, patches=True) > ENOUGH
+    whole = clip.encode_patches
+    monkeypatch.setattr(clip, "encode_patches", lambda images: (None, whole(images)[1] @ rotation(clip.dim)))
+    check_words(clip)
+    with pytest.raises(
+        ModelError, match=r"at their patches .* or read class tokens: `--features.crop-tokens class`"
+    ):
+        check_words(clip, patches=True)
+
+
+@pytest.mark.parametrize("same", [True, False], ids=["of this encoder", "of another"])
+def test_features_of_another_encoder_are_told_though_they_have_the_depth(tmp_path, caplog, same):
+    capture, encoders = load_capture(CAPTURE), Encoders("bundled", "none", "cpu")
+    turned = torch.eye(encoders.clip.dim) if same else rotation(encoders.clip.dim)
+    for view in capture.views.values():
+        photo = torch.from_numpy(view.load_image((160, 120))).permute(2, 0, 1)
+        tiles = photo.unfold(1, 40, 40).unfold(2, 40, 40).permute(1, 2, 0, 3, 4)  # 3 rows of 4
+        tokens = encoders.clip.encode_images(tiles.flatten(0, 1)) @ turned
+        np.save(tmp_path / f"{view.stem}.npy", tokens.reshape(3, 4, -1).numpy())
+    config = BuildConfig(clip="bundled", dino="none", features_from=tmp_path)
+    with caplog.at_level(logging.WARNING, logger="lexsplat"):
+        check_given(config, capture, encoders)
+    assert ("of another encoder, which --clip has to name" in caplog.text) is not same

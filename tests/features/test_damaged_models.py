@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from support.refusals import assert_reports
 
 from lexsplat import cli
@@ -65,10 +66,46 @@ def test_an_image_deviation_that_is_not_three_positive_numbers_is_refused(vit_fo
     refused(folder, expected, f"found {json.dumps(std)}", load=load_dino)
 
 
+def test_an_image_mean_of_another_range_than_the_file_says_is_refused(vit_folder, tmp_path):
+    folder = shutil.copytree(vit_folder, tmp_path / "vit")
+    path, content = folder / "preprocessor_config.json", {"image_mean": [122.8, 116.7, 104.1]}
+    path.write_text(json.dumps(content | {"image_std": [68.5, 66.6, 70.3]}))
+    refused(
+        folder, f"{path}: image_mean", "means within the colors 0 to 1", "122.8", "do_rescale", load=load_dino
+    )
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"image_mean": [127.5] * 3, "image_std": [51.0] * 3, "do_rescale": False},
+        {"image_mean": [1.0] * 3, "image_std": [0.4] * 3, "rescale_factor": 2 / 255},
+    ],
+    ids=["colors to 255", "colors to 2"],
+)
+def test_colors_are_scaled_as_the_preprocessor_says(vit_folder, tmp_path, content):
+    usual, other = (shutil.copytree(vit_folder, tmp_path / name) for name in ("usual", "other"))
+    (usual / "preprocessor_config.json").write_text(
+        json.dumps({"image_mean": [0.5] * 3, "image_std": [0.2] * 3})
+    )
+    (other / "preprocessor_config.json").write_text(json.dumps(content))
+    image = torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(0))
+    first, second = (load_dino(str(each)).encode_dense(image, short_side=32) for each in (usual, other))
+    torch.testing.assert_close(first, second, rtol=1e-4, atol=1e-5)
+
+
+def test_a_preprocessor_that_does_not_normalize_leaves_colors_as_they_are(vit_folder, tmp_path):
+    folder = shutil.copytree(vit_folder, tmp_path / "vit")
+    content = {"image_mean": [0.5] * 3, "image_std": [0.2] * 3, "do_normalize": False}
+    (folder / "preprocessor_config.json").write_text(json.dumps(content))
+    encoder = load_dino(str(folder))
+    assert (encoder._mean.flatten().tolist(), encoder._std.flatten().tolist()) == ([0, 0, 0], [1, 1, 1])
+
+
 def test_whole_numbers_are_numbers_and_other_entries_are_not_read(vit_folder, tmp_path):
     folder = shutil.copytree(vit_folder, tmp_path / "vit")
     content = {"image_mean": [0, 0, 0], "image_std": [1, 1, 1]}
-    content |= {"size": None, "crop_size": "large", "rescale_factor": [], "resample": {}}
+    content |= {"size": None, "crop_size": "large", "rescale_factor": 1 / 255, "resample": {}}
     (folder / "preprocessor_config.json").write_text(json.dumps(content))
     encoder = load_dino(str(folder))
     assert encoder._mean.flatten().tolist() == [0, 0, 0]
@@ -169,3 +206,27 @@ def test_json_that_is_no_tokenizer_is_refused_by_its_name(clip_copy, content):
     (clip_copy / "tokenizer.json").write_text(content)
     message = refused(clip_copy, f"{clip_copy / 'tokenizer.json'}: expected a tokenizer, found other content")
     assert "added_tokens'" not in message
+
+
+# -- the text tower
+
+
+def test_a_word_whose_numbers_are_not_finite_is_refused_though_no_check_reads_it(clip_copy):
+    weights = load_file(clip_copy / "model.safetensors")
+    weights["text_model.embeddings.token_embedding.weight"][77] = float("nan")
+    save_file(weights, clip_copy / "model.safetensors", {"format": "pt"})
+    for load in (load_clip, load_text):
+        refused(clip_copy, "finite", "NaN or infinity", load=load)
+
+
+def test_a_tokenizer_file_that_does_not_end_prompts_is_not_taken_as_it_is(clip_folder, clip_copy):
+    """The tower without transformers would read an embedding at some word; transformers adds the end itself."""
+    path = clip_copy / "tokenizer.json"
+    content = json.loads(path.read_text())
+    assert content["post_processor"]
+    path.write_text(json.dumps(content | {"post_processor": None}))
+    for load in (load_clip, load_text):
+        found, expected = (
+            load(str(each)).encode_text(["a car", "blue sky"]) for each in (clip_copy, clip_folder)
+        )
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)

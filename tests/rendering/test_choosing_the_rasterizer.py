@@ -17,7 +17,7 @@ from lexsplat.scenes.library import Library
 
 
 @pytest.fixture
-def gpu(monkeypatch):
+def install_gsplat(monkeypatch):
     """A GPU, and gsplat without its extension; a function installs an extension."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     backend = types.ModuleType("gsplat.cuda._backend")
@@ -28,13 +28,13 @@ def gpu(monkeypatch):
     backends.missing_gsplat.cache_clear()
 
 
-def test_auto_takes_the_gpu_where_gsplat_renders_on_it(gpu):
-    gpu()
+def test_auto_takes_the_gpu_where_gsplat_renders_on_it(install_gsplat):
+    install_gsplat()
     assert choose_rasterizer("auto") == choose_rasterizer("cuda") == "cuda"
     assert choose_rasterizer("cpu") == "cpu"
 
 
-def test_auto_takes_the_cpu_where_gsplat_cannot_render_and_states_it_once(gpu, caplog):
+def test_auto_takes_the_cpu_where_gsplat_cannot_render_and_states_it_once(install_gsplat, caplog):
     with caplog.at_level(NOTE, logger="lexsplat"):
         assert choose_rasterizer("auto") == choose_rasterizer("auto") == "cpu"
     assert caplog.messages == [
@@ -43,7 +43,7 @@ def test_auto_takes_the_cpu_where_gsplat_cannot_render_and_states_it_once(gpu, c
     ]
 
 
-def test_cuda_is_refused_with_options_that_every_command_has(gpu):
+def test_cuda_is_refused_with_options_that_every_command_has(install_gsplat):
     with pytest.raises(BackendError, match=r"nvcc .*, or rasterize on the CPU: --device cpu$"):
         choose_rasterizer("cuda")
 
@@ -54,7 +54,7 @@ def test_a_machine_without_a_gpu_does_not_load_gsplat(monkeypatch):
     assert choose_rasterizer("auto") == "cpu"
 
 
-def test_scenes_and_libraries_open_on_the_cpu_where_gsplat_cannot_render(gpu, tmp_path):
+def test_scenes_and_libraries_open_on_the_cpu_where_gsplat_cannot_render(install_gsplat, tmp_path):
     assert open_scene("demo").gaussians.device.type == "cpu"
     library = Library.create(tmp_path / "library")
     library.add(open_scene("demo").folder.root)
@@ -62,13 +62,13 @@ def test_scenes_and_libraries_open_on_the_cpu_where_gsplat_cannot_render(gpu, tm
     assert library.scene(record.name).gaussians.device.type == "cpu"
 
 
-def test_commands_answer_with_auto_and_refuse_cuda_in_one_line(gpu, capsys):
+def test_commands_answer_with_auto_and_refuse_cuda_in_one_line(install_gsplat, capsys):
     assert cli.main(["find", "demo", "red apple"]) == 0
     assert "red apple" in capsys.readouterr().out
     fails_in_one_line(capsys, ["find", "demo", "red apple", "--device", "cuda"], "gsplat", "--device cpu")
 
 
-def test_the_demo_is_built_on_the_cpu_where_gsplat_cannot_render(gpu, tmp_path, monkeypatch):
+def test_the_demo_is_built_on_the_cpu_where_gsplat_cannot_render(install_gsplat, tmp_path, monkeypatch):
     class Begun(Exception):
         pass
 

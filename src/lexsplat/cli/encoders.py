@@ -79,6 +79,8 @@ class EncodersCommand:
         clip = encoders.clip
         progress(Event("encoders", 1, 4))
         facts: dict[str, Any] = {"clip": _facts(clip) | {"words_ranked": check_words(clip)}}
+        if config.features.tokens != "class":
+            facts["clip"]["patches_ranked"] = check_words(clip, patches=True)
         progress(Event("encoders", 2, 4))
         if encoders.dino is not None:
             check_dense(encoders.dino)

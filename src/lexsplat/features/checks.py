@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
@@ -39,6 +40,8 @@ WORDS = tuple(PLACES)
 ENOUGH = 0.75
 """Least share of the other words that rank below the right one; 0.5 is chance."""
 
+_TILES = (3, 4)
+"""Rows and columns of tiles of a photo."""
 _MARGIN = 1.2  # side of an image, in sides of the box around what it shows
 
 
@@ -61,13 +64,18 @@ def _cut(image: Tensor, box: tuple[int, int, int, int], side: int) -> Tensor:
     return resize_images(crop[None], side, side)
 
 
-def rank_words(clip: ImageTextEncoder) -> float:
+def rank_words(clip: ImageTextEncoder, *, patches: bool = False) -> float:
     """How well words match images: the mean share of the other words that rank below the right one, in 0..1.
+
+    Args:
+        clip: The encoder.
+        patches: Compare the mean of an image's patches instead of its class token.
 
     Raises:
         ModelError: If the two towers give embeddings of different sizes, or equal embeddings to different images.
     """
-    images, texts = clip.encode_images(bundled_images(clip.image_size)), clip.encode_text(WORDS)
+    shown, texts = bundled_images(clip.image_size), clip.encode_text(WORDS)
+    images = clip.encode_patches(shown)[1].mean((1, 2)) if patches else clip.encode_images(shown)
     if images.shape[1] != texts.shape[1]:
         raise ModelError(
             f"model {clip.name}",
@@ -81,21 +89,62 @@ def rank_words(clip: ImageTextEncoder) -> float:
     return float(below.double().mean()) / (len(WORDS) - 1)
 
 
-def check_words(clip: ImageTextEncoder) -> float:
+def check_words(clip: ImageTextEncoder, *, patches: bool = False) -> float:
     """`rank_words`, at least `ENOUGH`.
 
     Raises:
         ModelError: If words rank little better than by chance, or as `rank_words`.
     """
-    right = rank_words(clip)
+    right = rank_words(clip, patches=patches)
     if right < ENOUGH:
+        read, other = (
+            (" at their patches", "; or read class tokens: `--features.crop-tokens class`")
+            if patches
+            else ("", "")
+        )
         raise ModelError(
             f"model {clip.name}",
-            expected=f"words that match the bundled images (at least {ENOUGH:.2f} of the others rank lower)",
+            expected=f"words that match the bundled images{read} (at least {ENOUGH:.2f} of the others rank lower)",
             found=f"{right:.2f}, where chance is 0.50",
-            remedy="choose another model",
+            remedy=f"choose another model{other}",
         )
     return right
+
+
+def rank_tiles(clip: ImageTextEncoder, photos: Iterable[Tensor], maps: Iterable[Tensor]) -> float:
+    """How well feature maps of another program are of an encoder: what `rank_words` is, for tiles of photos.
+
+    A tile's embedding by the encoder is compared with the mean features of each tile. What all have in common does
+    not count.
+
+    Args:
+        clip: The encoder.
+        photos: A few photos ``[3, H, W]`` in 0..1.
+        maps: Their features ``[h, w, D]``, D as of the encoder.
+
+    Returns:
+        The mean share of the other tiles that rank below the right one, in 0..1; 0.5 is chance.
+    """
+    rows, columns = _TILES
+    tiles, means = [], []
+    for photo, features in zip(photos, maps, strict=True):
+        for row in range(rows):
+            for column in range(columns):
+                tile = _part(photo.permute(1, 2, 0), row / rows, column / columns).permute(2, 0, 1)
+                tiles.append(resize_images(tile[None], clip.image_size, clip.image_size))
+                means.append(_part(features, row / rows, column / columns).mean((0, 1)))
+    own, given = clip.encode_images(torch.cat(tiles)), torch.stack(means)
+    own, given = (F.normalize(each - each.mean(0), dim=1) for each in (own, given))
+    similarity = own @ given.T
+    below = (similarity < similarity.diagonal()[:, None]).sum(1)
+    return float(below.double().mean()) / (len(own) - 1)
+
+
+def _part(image: Tensor, top: float, left: float) -> Tensor:
+    """The tile of an image ``[H, W, C]`` that begins at shares of its sides; of a small one at least a pixel."""
+    (height, width, _), (rows, columns) = image.shape, _TILES
+    y, x = int(top * height), int(left * width)
+    return image[y : max(y + 1, y + height // rows), x : max(x + 1, x + width // columns)]
 
 
 def check_dense(dino: DenseEncoder) -> None:

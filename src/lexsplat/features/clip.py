@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lexsplat.features.clip_image import ClipImages
 from lexsplat.features.clip_text import (
+    LEGACY_END,
     UNLIKE,
     UNLIKE_WORDS,
     ClipText,
@@ -67,6 +68,7 @@ class ClipEncoder(PretrainedModel):
         if self._texts is None:
             self._text_length = int(config.text_config.max_position_embeddings)
             self._tokenizer = _load_tokenizer(folder, name, config)
+            self._check_text(config)
         words = self.encode_text(UNLIKE_WORDS)
         self.dim = int(words.shape[-1])
         if F.pdist(words).min() < UNLIKE:
@@ -75,6 +77,18 @@ class ClipEncoder(PretrainedModel):
                 "fetch the whole model again, or choose another model",
                 f"the same embedding for {', '.join(UNLIKE_WORDS[:3])} ...",
             )
+
+    def _check_text(self, config: Any) -> None:
+        """Refuse a text tower with numbers that are not finite, and prompts without the end where CLIP reads them."""
+        named = self._model.named_parameters()
+        if not all(bool(value.isfinite().all()) for key, value in named if key.startswith("text_")):
+            raise self._refusal("finite weights of the text tower", "fetch it again", "NaN or infinity")
+        if config.model_type != "clip":
+            return
+        ids, end = self._tokenizer(UNLIKE_WORDS[0])["input_ids"], config.text_config.eos_token_id
+        if ids[-1] != (max(ids) if end == LEGACY_END else end):
+            wanted = f"a tokenizer that ends prompts with the model's end token ({end})"
+            raise self._refusal(wanted, "fetch the model again with its tokenizer files", f"token {ids[-1]}")
 
     def _own_model(self, folder: Path) -> Any:
         self._texts = None

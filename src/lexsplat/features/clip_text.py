@@ -31,7 +31,7 @@ _DEFAULTS = {  # of transformers' CLIPTextConfig, which files may leave out
     "num_attention_heads": 8, "max_position_embeddings": 77, "hidden_act": "quick_gelu", "layer_norm_eps": 1e-5,
     "eos_token_id": 49407,
 }  # fmt: skip
-_LEGACY_END = 2
+LEGACY_END = 2
 """An end token of this number stands for the largest number in the prompt, as in OpenAI's code."""
 _TOGETHER = 64
 """Prompts in one pass of `ClipText.encode_together`, at most."""
@@ -84,6 +84,10 @@ def light_tower(
     if tokenizer is None:
         return None
     tower = ClipText(settings, weights, tokenizer, device)
+    if not all(bool(value.isfinite().all()) for value in weights.values()) or not tower.ends_with_end(
+        "a car"
+    ):
+        return None
     words = tower.encode_text(UNLIKE_WORDS)
     return tower if bool(words.isfinite().all()) and F.pdist(words).min() >= UNLIKE else None
 
@@ -217,9 +221,14 @@ class ClipText:
     def _projected(self, hidden: Tensor) -> Tensor:
         return F.normalize(hidden @ self._weights["text_projection.weight"].T, dim=-1).cpu()
 
+    def ends_with_end(self, prompt: str) -> bool:
+        """Whether the tokenizer ends a prompt with the token whose embedding is that of the prompt."""
+        ids = self._tokens(prompt)
+        return len(ids) > 2 and self._place_of_end(ids) == len(ids) - 1
+
     def _place_of_end(self, ids: Tensor) -> int:
         """Place of the end token among the tokens ``[T]`` of a prompt."""
-        return int((ids if self._end == _LEGACY_END else (ids == self._end).int()).argmax())
+        return int((ids if self._end == LEGACY_END else (ids == self._end).int()).argmax())
 
     def on(self, device: torch.device | str) -> ClipText:
         """The same tower on a device."""

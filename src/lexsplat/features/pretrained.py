@@ -11,7 +11,7 @@ import json
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, ClassVar
@@ -142,8 +142,11 @@ def _has_bfloat16() -> bool:
 def normalization(folder: Path, default: tuple, device: torch.device) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation ``[3, 1, 1]`` from the model's preprocessing file, or ``default``.
 
+    They are those of images in 0..1, whatever the file scales colors by.
+
     Raises:
-        ModelError: If one of the two is not three finite numbers, or a deviation is not positive.
+        ModelError: If one of the two is not three finite numbers, a deviation is not positive, or they are of images
+            in another range than the file says.
     """
     settings, keys = preprocessing(folder), ("image_mean", "image_std")
     if not all(key in settings for key in keys):
@@ -161,7 +164,26 @@ def normalization(folder: Path, default: tuple, device: torch.device) -> tuple[T
             found=_excerpt(given[key]),
             remedy="fetch the model again",
         )
-    return mean.reshape(3, 1, 1).to(device), std.reshape(3, 1, 1).to(device)
+    scale = _scale(settings)
+    mean, std = (each.reshape(3, 1, 1).to(device) / scale for each in (mean, std))
+    if settings.get("do_normalize") is False:
+        mean, std = torch.zeros_like(mean), torch.ones_like(std) / scale
+    elif bool((mean > 1).any()):
+        raise ModelError(
+            f"{preprocessing_file(folder)}: image_mean",
+            expected=f"means within the colors 0 to {scale:g} of its images",
+            found=_excerpt(given["image_mean"]),
+            remedy='fetch the model again, or say "do_rescale": false if the images are not scaled',
+        )
+    return mean, std
+
+
+def _scale(settings: Mapping[str, Any]) -> float:
+    """The largest value of a color where a model's preprocessing subtracts the mean."""
+    if settings.get("do_rescale") is False:
+        return 255.0
+    factor = settings.get("rescale_factor")
+    return 255.0 * factor if isinstance(factor, float) and 1e-6 < factor < 1e6 else 1.0
 
 
 def _three_numbers(value: Any) -> Tensor | None:

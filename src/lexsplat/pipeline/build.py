@@ -18,13 +18,13 @@ from typing import Any
 
 from lexsplat.captures import Capture, View, load_annotations
 from lexsplat.codebook import Codebook, assign_code_maps, code_usage, fit_codebook, tell_codebook
-from lexsplat.features import FeatureMaps, check_external_features, read_external_features
+from lexsplat.features import FeatureMaps, read_external_features
 from lexsplat.language.code_maps import MaskedCodeMaps, mark_masked_cells
 from lexsplat.language.methods import FitRun, TrainingViews
 from lexsplat.pipeline.chosen_views import choice_path, kept_choice, views_to_read
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.pipeline.distribution import extract_on_workers
-from lexsplat.pipeline.encoding import Encoders, check_encoders, feature_maps, fetch_clip
+from lexsplat.pipeline.encoding import Encoders, check_encoders, check_given, feature_maps, fetch_clip
 from lexsplat.pipeline.geometry import GeometryRun, way_to_geometry
 from lexsplat.pipeline.inputs import (
     PhotoSurvey,
@@ -129,6 +129,7 @@ def build(
             if photos is not None and encodes:
                 sized = config.resolved(device, photos.size)
                 checked = check_encoders(sized, source or splats, photos.count, photos.size, listener)
+                check_given(config, photos.capture, checked)
             if source is None:
                 capture = capture_of_splats(splats, folder, config, device, listener)
             else:
@@ -229,8 +230,8 @@ class _Builder:
             source, cached = self.capture.root, any(self.folder.features_path.glob("*.safetensors"))
             count = 0 if cached else len(sizes)  # where some are stored, the time of the others is told later
             self.encoders = check_encoders(self.config, source, count, max(sizes), self.listener)
-        if self.encoders is not None and self.config.features_from is not None:
-            check_external_features(self.config.features_from, self.capture, self.encoders.clip.dim)
+        if self.encoders is not None:
+            check_given(self.config, self.capture, self.encoders)
         changes = not all(self._is_finished(name, stages[name]) for name in wanted)
         for name in wanted:
             self._run_stage(name, stages[name])

@@ -7,15 +7,22 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
+
 from lexsplat.captures import Capture
 from lexsplat.codebook import MAX_CODES
-from lexsplat.features import FeatureMaps, extract_features, load_external_features
+from lexsplat.features import (
+    FeatureMaps,
+    check_external_features,
+    extract_features,
+    load_external_features,
+)
 from lexsplat.features.cache import without_masked_cells
-from lexsplat.features.checks import ENOUGH, check_dense, rank_words
+from lexsplat.features.checks import ENOUGH, check_dense, rank_tiles, rank_words
 from lexsplat.features.clip import check_patches
 from lexsplat.features.clip_text import UNLIKE_WORDS
 from lexsplat.features.estimate import Estimate, estimate
-from lexsplat.features.extraction import missing_views
+from lexsplat.features.extraction import missing_views, reduced
 from lexsplat.features.hub import model_folder
 from lexsplat.features.segments2d import load_segmenter, pooled_features
 from lexsplat.pipeline.config import BuildConfig
@@ -30,6 +37,8 @@ log = logging.getLogger("lexsplat")
 
 _TOLD_FROM = 12
 """Fewest photos for which the time is estimated here: the estimate takes about as long as one photo."""
+_COMPARED, _SHORT_SIDE = 4, 480
+"""Photos, and pixels of their short sides, by which features of another program are compared with the encoder."""
 _MANY = 100
 """Fewest photos for which the bundled encoders, too, are timed before structure from motion."""
 
@@ -52,6 +61,7 @@ class Encoders:
         self._clip_name, self._dino_name, self._segments, self.device = clip, dino, segments, device
         self.text: TextTower | None = None
         self.estimate: Estimate | None = None  # of one photo, once it is measured
+        self.compared = False  # with features of another program
         self.told = 0  # photos for which the time of the features was told last
 
     @classmethod
@@ -147,16 +157,21 @@ def check_encoders(
     listener(Event("encoders", 0, 4))
     clip = encoders.clip
     listener(Event("encoders", 1, 4))
-    right = rank_words(clip)
+    ranks = {"": rank_words(clip)}
+    if config.features.tokens != "class":
+        ranks[" at their patches"] = rank_words(clip, patches=True)
     listener(Event("encoders", 2, 4))
-    if right < ENOUGH:
-        # Only a warning: an encoder may be made for other things than the bundled images show.
-        log.warning(
-            "model %s: words match bundled images by %.2f only (expected %.2f, chance 0.50); answers may be wrong",
-            config.clip,
-            right,
-            ENOUGH,
-        )
+    for read, right in ranks.items():
+        if right < ENOUGH:
+            # Only a warning: an encoder may be made for other things than the bundled images show.
+            log.warning(
+                "model %s: words match bundled images%s by %.2f only (expected %.2f, chance 0.50);"
+                " answers may be wrong",
+                config.clip,
+                read,
+                right,
+                ENOUGH,
+            )
     if encoders.dino is not None:
         check_dense(encoders.dino)
     listener(Event("encoders", 3, 4))
@@ -164,6 +179,44 @@ def check_encoders(
         _estimate(encoders, config, photos, size)
     listener(Event("encoders", 4, 4))
     return encoders
+
+
+def check_given(config: BuildConfig, capture: Capture | None, encoders: Encoders) -> None:
+    """Refuse features of another program that do not fit, and warn of those that are of another encoder.
+
+    Args:
+        config: Settings of the build.
+        capture: The photos; cameras are not read. None checks nothing.
+        encoders: The encoders of the build, whose words the features are compared with.
+
+    Raises:
+        FileFormatError: As `check_external_features`.
+    """
+    if config.features_from is None or capture is None:
+        return
+    clip, folder = encoders.clip, config.features_from
+    check_external_features(folder, capture, clip.dim)
+    if encoders.compared:
+        return
+    encoders.compared = True
+    names = capture.train_names[:: max(1, len(capture.train_names) // _COMPARED)][:_COMPARED]
+    maps = load_external_features(folder, capture, memory=config.memory_bytes, dimension=clip.dim)
+    photos = (capture.views[name] for name in names)
+    images = (view.load_image(reduced(view.capture_size, _SHORT_SIDE)) for view in photos)
+    right = rank_tiles(
+        clip,
+        (torch.from_numpy(image).permute(2, 0, 1) for image in images),
+        (maps[name].clip for name in names),
+    )
+    if right < ENOUGH:
+        log.warning(
+            "%s: the features match what %s sees in the photos by %.2f only (expected %.2f, chance 0.50); "
+            "words have no meaning in features of another encoder, which --clip has to name",
+            folder,
+            f"--clip {config.clip}",
+            right,
+            ENOUGH,
+        )
 
 
 def _estimate(encoders: Encoders, config: BuildConfig, photos: int, size: tuple[int, int]) -> None:

@@ -123,10 +123,12 @@ class PhotoSurvey:
     Args:
         count: Number of training photos, or of frames to sample from a video.
         size: Width and height of the largest, upright; a guess for a video.
+        capture: The photos, without cameras; None for a video.
     """
 
     count: int
     size: tuple[int, int]
+    capture: Capture | None = None
 
 
 def preview_capture(
@@ -193,7 +195,7 @@ def survey_photos(
     largest = _largest(capture)
     if config.downscale is not None:
         _check_size(source, round(largest[0] / config.downscale), round(largest[1] / config.downscale))
-    return PhotoSurvey(len(capture.train_names), largest)
+    return PhotoSurvey(len(capture.train_names), largest, capture)
 
 
 def check_given_maps(config: BuildConfig, capture: Capture) -> None:
