@@ -9,6 +9,9 @@ import time
 import pytest
 
 from lexsplat.features import hub
+from lexsplat.features.hub import content_hash
+from lexsplat.features.text import check_encoder
+from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.user_cache import user_cache
 
 
@@ -119,3 +122,18 @@ def test_a_cache_that_cannot_be_written_does_no_harm(model, tmp_path, forget):
     first = hub.content_hash(model, "clip")
     forget()
     assert hub.content_hash(model, "clip") == first
+
+
+@pytest.mark.slow
+def test_settings_of_a_tokenizer_that_come_after_the_features_make_no_other_encoder(clip_folder, tmp_path):
+    folder = shutil.copytree(clip_folder, tmp_path / "clip")
+    for name in ("tokenizer_config.json", "special_tokens_map.json"):
+        (folder / name).unlink(missing_ok=True)
+    built_with = content_hash(folder, "clip")
+    (folder / "special_tokens_map.json").write_text("{}")
+    assert content_hash(folder, "clip") != built_with
+    check_encoder(str(folder), content_hash(folder, "clip"), built_with)
+    with open(folder / "tokenizer.json", "a") as file:
+        file.write(" ")
+    with pytest.raises(ModelError, match="another one"):
+        check_encoder(str(folder), content_hash(folder, "clip"), built_with)

@@ -177,7 +177,15 @@ def content_hash(folder: Path, tower: str) -> str:
     The process keeps the hash under the place, size and time of change of the files. The user's cache keeps hashes of
     large models under the same facts.
     """
-    files = loaded_files(folder, tower)
+    return _hash_of(loaded_files(folder, tower))
+
+
+def hash_without_settings(folder: Path) -> str:
+    """The `content_hash` of a CLIP without the settings beside its tokenizer's vocabulary, which may come later."""
+    return _hash_of([path for path in loaded_files(folder, "clip") if path.name not in _TOKENIZER_SETTINGS])
+
+
+def _hash_of(files: list[Path]) -> str:
     state = _state(files)
     if state in _hashes:
         return _hashes[state]
