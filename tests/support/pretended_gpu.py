@@ -14,8 +14,7 @@ Tests on it check that tensors are on the right devices, how often the host wait
 value, copying to the host, or copying from pageable host memory), and the arguments passed to gsplat's Python code.
 They cannot check the results, summation order, speed and memory of CUDA kernels; whether an operation exists on CUDA;
 asynchronous execution; the synchronizations inside gsplat's extension (one per projection); the restrictions of
-inference mode; and libraries that depend on torch's C++ types (torch's optimizers use their per-tensor paths here,
-not the multi-tensor ones).
+inference mode; and libraries that depend on torch's C++ types (torch's optimizers take their per-tensor paths here).
 """
 
 from __future__ import annotations
@@ -414,6 +413,7 @@ _CUDA = {
     "is_bf16_supported": lambda including_emulation=True: True,
     "is_current_stream_capturing": lambda: False,
     "empty_cache": lambda: None,
+    "synchronize": lambda device=None: waits.update(["synchronize"]),
     "reset_peak_memory_stats": lambda device=None: None,
     "max_memory_allocated": lambda device=None: 1 << 20,
     "memory_allocated": lambda device=None: 1 << 20,
@@ -428,7 +428,7 @@ def pretending(monkeypatch: Any) -> Iterator[Counter[str]]:
     """A pretended GPU in this thread and in threads started inside the block; yields `waits`."""
     for name, stand_in in _CUDA.items():
         monkeypatch.setattr(torch.cuda, name, stand_in)
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda device=None: waits.update(["synchronize"]))
+    monkeypatch.setattr(torch.accelerator, "current_accelerator", lambda **_: None)  # it asks a driver
     monkeypatch.setattr(torch, "Generator", PretendedGenerator)
     run = threading.Thread.run
 
