@@ -38,6 +38,7 @@ class Viewers:
     like: Selection
     chosen: Camera | None = None
     _taken: list[str] = field(default_factory=list, init=False)
+    _known: dict[int, tuple[Selection, NDArray[np.float64]]] = field(default_factory=dict, init=False)
 
     def frame(self, target: Selection, reference: Selection) -> Frame:
         """The frame of the view that decides for two things.
@@ -59,7 +60,8 @@ class Viewers:
             weights = np.where(answers + 1 == totals.argmax(), weights, 0.0)
         best = int(weights.argmax())
         self._taken.append(self._names[best])
-        return frame_of(self.like.cameras[self._names[best]], self.like.up.direction)
+        right, ahead = self._level
+        return Frame(right[best], ahead[best], self._up)
 
     @property
     def seen_from(self) -> str:
@@ -84,8 +86,18 @@ class Viewers:
     @cached_property
     def _axes(self) -> NDArray[np.float64]:
         """The axis to the right of each view, or ahead of it ``[V, 3]``."""
-        right, ahead = level_axes([self.like.cameras[name] for name in self._names], self.like.up.direction)
+        right, ahead = self._level
         return right if self.relation in ("left of", "right of") else ahead
+
+    @cached_property
+    def _level(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The axes to the right of each view and ahead of it ``[V, 3]``."""
+        return level_axes([self.like.cameras[name] for name in self._names], self._up)
+
+    @cached_property
+    def _up(self) -> NDArray[np.float64]:
+        up = np.asarray(self.like.up.direction, float)
+        return up / np.linalg.norm(up)
 
     @cached_property
     def _projections(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -97,6 +109,12 @@ class Viewers:
         )
 
     def _shares(self, one: Selection) -> NDArray[np.float64]:
+        """The share of each view that a thing covers ``[V]``, computed once for all pairs that it is in."""
+        if id(one) not in self._known:
+            self._known[id(one)] = one, self._covered(one)  # which keeps the thing, and so its number
+        return self._known[id(one)][1]
+
+    def _covered(self, one: Selection) -> NDArray[np.float64]:
         """The share of each view that a thing covers ``[V]``; 1 or 0 where no rendering of the views is kept."""
         seen = self.like.seen
         if seen is not None and seen.complete:
