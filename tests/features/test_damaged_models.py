@@ -219,8 +219,12 @@ def test_a_word_whose_numbers_are_not_finite_is_refused_though_no_check_reads_it
         refused(clip_copy, "finite", "NaN or infinity", load=load)
 
 
-def test_a_tokenizer_file_that_does_not_end_prompts_is_not_taken_as_it_is(clip_folder, clip_copy):
+def test_a_tokenizer_file_that_does_not_end_prompts_is_not_taken_as_it_is(clip_copy, tmp_path):
     """The tower without transformers would read an embedding at some word; transformers adds the end itself."""
+    config = json.loads((clip_copy / "config.json").read_text())
+    config["text_config"]["eos_token_id"] = 2  # as OpenAI's: the largest number of a prompt is its end
+    (clip_copy / "config.json").write_text(json.dumps(config))
+    clip_folder = shutil.copytree(clip_copy, tmp_path / "whole")
     path = clip_copy / "tokenizer.json"
     content = json.loads(path.read_text())
     assert content["post_processor"]

@@ -84,9 +84,8 @@ def light_tower(
     if tokenizer is None:
         return None
     tower = ClipText(settings, weights, tokenizer, device)
-    if not all(bool(value.isfinite().all()) for value in weights.values()) or not tower.ends_with_end(
-        "a car"
-    ):
+    finite = all(bool(value.isfinite().all()) for value in weights.values())
+    if not finite or not tower.ends_prompts():
         return None
     words = tower.encode_text(UNLIKE_WORDS)
     return tower if bool(words.isfinite().all()) and F.pdist(words).min() >= UNLIKE else None
@@ -221,9 +220,9 @@ class ClipText:
     def _projected(self, hidden: Tensor) -> Tensor:
         return F.normalize(hidden @ self._weights["text_projection.weight"].T, dim=-1).cpu()
 
-    def ends_with_end(self, prompt: str) -> bool:
+    def ends_prompts(self) -> bool:
         """Whether the tokenizer ends a prompt with the token whose embedding is that of the prompt."""
-        ids = self._tokens(prompt)
+        ids = self._tokens(UNLIKE_WORDS[0])
         return len(ids) > 2 and self._place_of_end(ids) == len(ids) - 1
 
     def _place_of_end(self, ids: Tensor) -> int:

@@ -182,8 +182,9 @@ def _scale(settings: Mapping[str, Any]) -> float:
     """The largest value of a color where a model's preprocessing subtracts the mean."""
     if settings.get("do_rescale") is False:
         return 255.0
-    factor = settings.get("rescale_factor")
-    return 255.0 * factor if isinstance(factor, float) and 1e-6 < factor < 1e6 else 1.0
+    factor: Any = settings.get("rescale_factor")
+    usable = isinstance(factor, (int, float)) and not isinstance(factor, bool) and 1e-6 < factor < 1e6
+    return 255.0 * factor if usable else 1.0
 
 
 def _three_numbers(value: Any) -> Tensor | None:

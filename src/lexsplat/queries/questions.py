@@ -8,7 +8,7 @@ from functools import lru_cache
 from lexsplat.queries.everyday import everyday_words
 from lexsplat.queries.late import late
 from lexsplat.queries.leftovers import NUMBERS, ORDINALS, left_over
-from lexsplat.queries.rewording import CONTRACTIONS, REWORDED
+from lexsplat.queries.rewording import CONTRACTIONS, LARGE, REWORDED
 from lexsplat.queries.spelling import frame_errors
 from lexsplat.queries.vocabulary import COLORS, QUALITIES, STATES, default_vocabulary
 
@@ -101,7 +101,7 @@ _FRAMES: tuple[tuple[str, str], ...] = (
     (r"(?:what (?:is|are) )?(?:the )?distances? (?:between (.+?) and|(?:from|of) (.+?) (?:to|from)) (?!me$|us$|here$)(.+)$", r"\1\2 and \3"),
     (r"(?:what (?:is|are) )?(?:the )?colou?rs? of ", ""),
     (r"(?:what|which) colou?rs? (?:does|do) (.+?) have$", r"\1"),
-    (r"how (?:big|large|small|tall|short|high|low|wide|long|deep|thick) (?:is|are) (?!.*\bthan\b)", ""),
+    (rf"how {LARGE} (?:is|are) (?!.*\bthan\b)", ""),
     (rf"how (?:many|much)(?: of)?(?: the)? ([\w ]+?) (?:is|are) ((?:not )?(?:{'|'.join(sorted(QUALITIES))}))$", r"\1 that are \2"),
     (r"how (?:many|much)(?: of)?(?: the)? (?:different )?", ""),
     (r"count(?: up)?(?: all)?(?: of)?(?: the)? (?=\S)", ""),
@@ -176,7 +176,7 @@ _LEFT_OVER = late(
 )
 """Words of a question that stay in a thing when no frame takes them off, in addition to those of `leftovers`."""
 _HOW_LARGE = late(
-    r"^(?:.*\b)?how (?:big|large|small|tall|short|high|low|wide|long|deep|thick) (?:is|are) (?!.*\bthan\b)|"
+    rf"^(?:.*\b)?how {LARGE} (?:is|are) (?!.*\bthan\b)|"
     r"\b(?:sizes?|heights?|widths?|lengths?|dimensions) of\b",
     re.IGNORECASE,
 )

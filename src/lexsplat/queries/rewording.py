@@ -95,17 +95,18 @@ _NONE = (
 )
 """That there is none of a thing."""
 _LENGTH = "(?:mm|cm|m|(?:milli|centi)?met(?:er|re)s?|inch(?:es)?|foot|feet|ft|units?)"
-_LARGE = "(?:big|large|small|tall|short|high|low|wide|long|deep|thick)"
+LARGE = "(?:big|large|small|tall|short|high|low|wide|long|deep|thick)"
+"""Words that ask for a size after "how"."""
 REWORDED = (
     *_NONE,
     (
         late(rf"^(?:the )?({'|'.join(sorted(COLORS - {'gold', 'orange', 'silver'}))})$", re.IGNORECASE),
         r"\1 thing",
     ),
-    (late(rf"^how many {_LENGTH} ({_LARGE}|far) ", re.IGNORECASE), r"how \1 "),
+    (late(rf"^how many {_LENGTH} ({LARGE}|far) ", re.IGNORECASE), r"how \1 "),
     (
         late(
-            rf"^((?:.*\b)?(?:how (?:{_LARGE}|far) (?:is|are)|(?:sizes?|heights?|widths?|lengths?|dimensions|distances?) "
+            rf"^((?:.*\b)?(?:how (?:{LARGE}|far) (?:is|are)|(?:sizes?|heights?|widths?|lengths?|dimensions|distances?) "
             rf"(?:of|between|from))\b.+) in {_LENGTH}$",
             re.IGNORECASE,
         ),

@@ -99,15 +99,6 @@ class Viewers:
         up = np.asarray(self.like.up.direction, float)
         return up / np.linalg.norm(up)
 
-    @cached_property
-    def _projections(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """The matrix from the world to pixels of each view ``[V, 3, 4]``, and its width and height ``[V, 2]``."""
-        cameras = [self.like.cameras[name] for name in self._names]
-        matrices = [camera.K @ camera.viewmat[:3] for camera in cameras]
-        return np.array(matrices).reshape(-1, 3, 4), np.array([(c.width, c.height) for c in cameras]).reshape(
-            -1, 2
-        )
-
     def _shares(self, one: Selection) -> NDArray[np.float64]:
         """The share of each view that a thing covers ``[V]``, computed once for all pairs that it is in."""
         if id(one) not in self._known:
@@ -119,10 +110,8 @@ class Viewers:
         seen = self.like.seen
         if seen is not None and seen.complete:
             return seen.covered(one.indices)
-        matrices, sizes = self._projections
-        local = matrices @ np.append(one.center, 1.0)
-        pixels = local[:, :2] / np.maximum(local[:, 2:], 1e-6)
-        return np.where(((pixels >= 0) & (pixels < sizes)).all(1) & (local[:, 2] > 1e-6), 1.0, 0.0)
+        cameras = [self.like.cameras[name] for name in self._names]
+        return np.array([float(camera.project(one.center)[2]) for camera in cameras])
 
     def _answers(self, target: Selection, reference: Selection) -> NDArray[np.int64]:
         """The vote of each view ``[V]``: -1 left or in front, 1 right or behind, 0 neither."""
