@@ -1,6 +1,7 @@
 """Whether segments end where things end: boundary recall against masks.
 
     python benchmarks/boundaries.py output/bonsai --pictures FOLDER
+    python benchmarks/boundaries.py output/bonsai --sheet docs/images/segments.png --sheet-levels 1 4
 
 Renders the segments of each level into the held-out views that have masks: a pixel shows the segment with the largest
 weight in it. Recall is the share of the masks' outline that has a border between segments within ``--tolerance``
@@ -10,6 +11,7 @@ picture is no outline.
 
 from __future__ import annotations
 
+from colorsys import hsv_to_rgb
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +40,10 @@ def main() -> None:
     parser.add_argument(
         "--pictures", type=Path, help="write VIEW-LEVEL.png: borders yellow, outlines of masks pink"
     )
+    parser.add_argument(
+        "--sheet", type=Path, help="write one picture: segments in flat colors, outlines of masks black"
+    )
+    parser.add_argument("--sheet-levels", type=int, nargs="+", default=[1, 4], help="its columns")
     options = parser.parse_args()
     scene = lexsplat.open_scene(str(options.scene))
     if scene.field.segments is None or scene.folder is None:
@@ -57,6 +63,12 @@ def main() -> None:
         recall, chance = np.mean(found, 0)
         rows.append({"level": level, "segments": segments, "recall": float(recall), "chance": float(chance)})
         print(f"level {level}: {segments:6,} segments, recall {recall:.3f}, chance {chance:.3f}")
+    if options.sheet:
+        columns = [
+            np.concatenate([flat(shown_segments(scene, view, level), outlines[view]) for view in outlines])
+            for level in options.sheet_levels
+        ]
+        Image.fromarray(np.concatenate(columns, 1)).save(options.sheet, optimize=True)
     write_record(options.json, rows, scene=str(options.scene), tolerance=options.tolerance)
 
 
@@ -113,6 +125,15 @@ def drawn(scene: Scene, view: str, borders: Mask, outline: Mask) -> NDArray[np.u
     """The rendering of a view with both kinds of lines."""
     pixels = (scene.render(view).image.clamp(0, 1).numpy() * 255).round().astype(np.uint8)
     pixels[borders], pixels[outline] = _BORDER, _OUTLINE
+    return pixels
+
+
+def flat(shown: NDArray[np.int64], outline: Mask) -> NDArray[np.uint8]:
+    """Segments in colors of their own, far apart for neighboring numbers, and outlines in black."""
+    hues = np.arange(shown.max() + 1) * 0.618 % 1
+    colors = [hsv_to_rgb(hue, 0.3 + 0.3 * (hue * 7 % 1), 0.95 - 0.3 * (hue * 13 % 1)) for hue in hues]
+    pixels = (np.array([*colors, (0, 0, 0)]) * 255).round().astype(np.uint8)[shown]
+    pixels[outline] = 0
     return pixels
 
 
