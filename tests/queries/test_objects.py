@@ -21,6 +21,7 @@ from lexsplat.queries.objects import (
     likeliest_things,
     name_probabilities,
     pieces_of_others,
+    surface_fits_better,
     whole_segments,
     with_surfaces,
 )
@@ -174,6 +175,15 @@ def test_the_likeliest_thing_needs_half_and_is_no_surface():
     lowest = np.array([0, 1, 2, 3, 1])
     assert likeliest_things(lowest, known, strengths, surfaces).tolist() == [5, 8, -1, -1, 8]
     assert likeliest_things(lowest, known, strengths, np.ones(3, bool)).tolist() == [-1] * 5
+
+
+def test_a_surface_fits_better_where_its_name_is_clearly_stronger_than_that_of_each_object():
+    #                              table lamp mug
+    strengths = np.array([[0.9, 0.6, 0.7], [0.5, 0.6, 0.2], [0.0, 0.0, 0.0]])
+    surfaces, lowest = np.array([True, False, False]), np.array([1, 0, 0, 2])
+    expected = [[False, False, True], [False, True, False], [False, True, False], [False] * 3]
+    assert surface_fits_better(lowest, strengths, surfaces).tolist() == expected
+    assert not surface_fits_better(lowest, strengths, np.zeros(3, bool)).any(), "no surface is known"
 
 
 def names_with_surfaces(strengths, words, masses, surfaces) -> list[int]:

@@ -14,7 +14,7 @@ from lexsplat.queries.vocabulary import default_vocabulary
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.listed import listed_as, refuse_doubtful
-from lexsplat.scenes.objects import objects_of, with_pieces_apart
+from lexsplat.scenes.objects import objects_of, with_pieces_apart, with_renamed
 from lexsplat.scenes.scene import Scene, open_scene
 from lexsplat.scenes.words import of_color_told
 
@@ -196,6 +196,21 @@ def test_a_piece_before_a_wall_joins_a_thing_that_much_of_it_is_like(demo, share
     nothing = torch.full_like(neck, -1, dtype=torch.long)
     pieces = with_pieces_apart(demo, wall.mask | neck, nothing, torch.where(like, 7, nothing))
     assert float((pieces[neck] == 7).float().mean()) == pytest.approx(float(joins), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("piece", "renamed", "joins"),
+    [("stack of books", True, True), ("stack of books", False, False), ("apple", True, False)],
+)
+def test_what_gets_the_name_of_a_thing_it_is_connected_to_is_a_part_of_it(demo, piece, renamed, joins):
+    """On another build the edge of the top book was "table lamp" until all of it was named."""
+    books, held = listed(demo, "stack of books"), listed(demo, piece)
+    heights = demo.gaussians.means[held.indices, 2]
+    part = held.within(held.mask & (demo.gaussians.means[:, 2] > heights.quantile(0.8)))
+    part = part.described(phrase="stack of books")
+    lower = books.within(~part.mask)
+    found = with_renamed([lower, part], [False, renamed], lambda thing: thing)
+    assert [len(each) for each in found] == ([len(books)] if joins else [len(lower), len(part)])
 
 
 @pytest.mark.slow

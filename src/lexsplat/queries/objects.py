@@ -22,7 +22,7 @@ FITS = 0.6
 _PART = 0.5
 """Smallest strength of that name at its parts."""
 _CLEARLY = 0.25
-"""A thing's name describes a piece in a surface clearly better if it is stronger by this."""
+"""A name describes a piece in a surface, or a surface under a thing, clearly better if it is stronger by this."""
 _WHOLE = 0.75
 """A name describes a segment as a whole if it describes this share of what the views show of it."""
 _SLOPE = 12.0
@@ -171,6 +171,23 @@ def likeliest_things(
         return np.full_like(lowest, -1)
     here = strengths[np.ix_(lowest, np.flatnonzero(~surfaces))]
     return np.where(here.max(1) >= _PART, known[~surfaces][here.argmax(1)], -1)
+
+
+def surface_fits_better(
+    lowest: IntArray, strengths: FloatArray, surfaces: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Whether the name of a surface describes lowest segments clearly better than the name of each object.
+
+    Args:
+        lowest: Number in 0..V-1 of each lowest segment ``[S]``.
+        strengths: How well the words of the objects describe each segment ``[V, K]``.
+        surfaces: Which of them are surfaces that may be meant ``[K]``.
+
+    Returns:
+        ``[S, K]``.
+    """
+    here = strengths[lowest]
+    return here[:, surfaces].max(1, keepdims=True, initial=-np.inf) - here >= _CLEARLY
 
 
 def name_probabilities(strengths: FloatArray) -> FloatArray:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lexsplat.queries.objects import (
@@ -15,6 +16,7 @@ from lexsplat.queries.objects import (
     likeliest_things,
     name_probabilities,
     pieces_of_others,
+    surface_fits_better,
     whole_segments,
     with_surfaces,
 )
@@ -143,26 +145,33 @@ def objects_of(scene: Scene, vocabulary: Sequence[str] = ()) -> tuple[Selection,
     for number in known[surfaces].tolist():
         pieces = with_pieces_apart(scene, named == number, pieces, things)
     found: list[Selection] = []
+    renamed: list[bool] = []
     carriers = torch.tensor([number for number in known.tolist() if words[number] in CARRIERS]).to(named)
     # Objects share no Gaussian, so they share scores. Surfaces come last: pieces of things leave them.
     scores, shown = torch.zeros_like(segments.masses), ~scene.hidden
     ground = Ground(scene.gaussians, shown & (segments.masses >= _SEEN), scene.world.up.direction)
-    for done, number in enumerate([*known[~surfaces].tolist(), *known[surfaces].tolist()]):
+
+    def with_names(thing: Selection) -> Selection:
+        return _named(thing, words, classifier.strengths(texts, _mean_codes(scene, thing)[None])[0])
+
+    better = surface_fits_better(codes.numbers[0], strengths, np.isin(known, carriers.cpu()))
+    for done, place in enumerate([*np.flatnonzero(~surfaces), *np.flatnonzero(surfaces)]):
+        number = int(known[place])
         scene.listener(Event("objects", done, len(known)))
         mask, name = named == number, words[number]
         both = scene.selection(mask | (pieces == number), scores, phrase=name)
         for each in [both] if name in STUFF else _instances(both, mask):
             named[each.indices] = number
             if name not in SURFACES:
-                each = _without_surface(each, named, ground, carriers, segments.labels)
+                each = _without_surface(each, named, ground, carriers, segments.labels, better[:, place])
             each = each.within(shown)
             if (
                 each and float(scene.gaussians.opacities[each.indices].mean()) >= FAINT
             ):  # not what no view shows
-                found.append(
-                    _named(each, words, classifier.strengths(texts, _mean_codes(scene, each)[None])[0])
-                )
+                found.append(with_names(each))
+                renamed.append(found[-1].phrase != name)
     scene.listener(Event("objects", len(known), len(known)))
+    found = with_renamed(found, renamed, with_names)
     return tuple(sorted(found, key=lambda each: -float(segments.masses[each.indices].sum())))
 
 
@@ -214,7 +223,12 @@ def with_pieces_apart(
 
 
 def _without_surface(
-    thing: Selection, named: torch.Tensor, ground: Ground, carriers: torch.Tensor, labels: torch.Tensor
+    thing: Selection,
+    named: torch.Tensor,
+    ground: Ground,
+    carriers: torch.Tensor,
+    labels: torch.Tensor,
+    described: NDArray[np.bool_],
 ) -> Selection:
     """The thing without its segments that are the surface it stands on; they are named as that surface.
 
@@ -224,10 +238,11 @@ def _without_surface(
         ground: What may show a surface.
         carriers: Words of the surfaces that carry things.
         labels: The lowest segment of each Gaussian ``[N]``.
+        described: Which lowest segments such a surface's word describes clearly better than the thing's ``[S]``.
     """
     surface = ground.around(thing)
     surface = surface[torch.isin(named[surface], carriers)]
-    back = underfoot(thing, surface, labels)
+    back = underfoot(thing, surface, labels, described)
     if not len(back):
         return thing
     means = thing.gaussians.means.detach()
@@ -248,6 +263,40 @@ def _instances(both: Selection, mask: torch.Tensor) -> list[Selection]:
     order = kept[np.argsort(-weights[kept], kind="stable")]
     members = torch.from_numpy(labels).to(both.indices.device)
     return [both.part(both.indices[members == int(label)]) for label in order]
+
+
+def with_renamed(
+    things: Sequence[Selection], renamed: Sequence[bool], with_names: Callable[[Selection], Selection]
+) -> list[Selection]:
+    """The things, where one whose name gave way to that of a thing it is connected to is a part of that thing.
+
+    The edge of a book below a lamp may show more of the lamp than its other parts do, so that it is no part of the
+    books until all of it is named.
+
+    Args:
+        things: Things that share no Gaussian.
+        renamed: Which of them have another name than their segments ``[T]``.
+        with_names: Names a thing.
+    """
+    kept = list(things)
+    for part in (thing for thing, changed in zip(things, renamed) if changed):
+        for place, whole in enumerate(kept):
+            if whole is part or whole.phrase != part.phrase or not _is_connected(part, whole):
+                continue
+            kept[place] = with_names((whole | part).described(phrase=whole.phrase))
+            kept = [thing for thing in kept if thing is not part]
+            break
+    return kept
+
+
+def _is_connected(part: Selection, whole: Selection) -> bool:
+    """Whether most of a part lies in the cluster that holds most of a whole."""
+    both = (whole | part).described(phrase=whole.phrase)
+    labels, weights = both._clusters()
+    own = part.mask[both.indices].cpu().numpy()
+    opacities = both.gaussians.opacities[both.indices].detach().cpu().double().numpy()
+    shares = [np.bincount(labels[each], opacities[each], len(weights)) for each in (own, ~own)]
+    return bool(shares[0].argmax() == shares[1].argmax())
 
 
 def _mean_codes(scene: Scene, thing: Selection) -> torch.Tensor:

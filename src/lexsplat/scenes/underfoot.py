@@ -1,7 +1,8 @@
 """Segments of a thing that are the surface that it stands on.
 
 The table within a ring, and a strip of cloth beside it, look like the ring to the encoder, whose crops show both.
-They lie as deep as the table around, and have its colors. They go back to it: a recolored ring leaves its wood alone.
+They lie as deep as the table around, and have its colors, or the table's name describes them clearly better than the
+ring's. They go back to it: a recolored ring leaves its wood alone.
 
 Dimension letters: N Gaussians of the scene, M of the thing, S of the surface near it, K neighbors.
 """
@@ -67,13 +68,16 @@ class Ground:
         return self.indices[torch.from_numpy(near[beside & level]).to(self.indices.device)]
 
 
-def underfoot(thing: Selection, surface: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+def underfoot(
+    thing: Selection, surface: torch.Tensor, labels: torch.Tensor, described: NDArray[np.bool_]
+) -> torch.Tensor:
     """The Gaussians of a thing whose segments are the surface around it.
 
     Args:
         thing: The thing.
         surface: Indices of Gaussians at its foot (`Ground.around`) that are of surfaces that carry things ``[S]``.
         labels: The lowest segment of each Gaussian ``[N]``.
+        described: Which lowest segments a surface's name describes clearly better than the thing's ``[S]``.
 
     Returns:
         Their indices ``[B]``.
@@ -100,9 +104,8 @@ def underfoot(thing: Selection, surface: torch.Tensor, labels: torch.Tensor) -> 
     level_too = np.abs(raised) <= thick
     segments, weights = labels[thing.indices].cpu().numpy(), thing.points[1]
     totals = np.bincount(segments, weights)
-    found = (np.bincount(segments, weights * level_too) >= _MOST * totals) & (
-        np.bincount(segments, weights * alike) >= _MOST * totals
-    )
+    found = np.bincount(segments, weights * level_too) >= _MOST * totals
+    found &= (np.bincount(segments, weights * alike) >= _MOST * totals) | described[: len(totals)]
     return thing.indices[torch.from_numpy(found[segments]).to(thing.indices.device)]
 
 
