@@ -19,7 +19,7 @@ from support.tiny_capture import SPHERES, camera_poses, trace
 from lexsplat import cli
 from lexsplat.captures import Capture, load_capture
 from lexsplat.codebook import Codebook
-from lexsplat.features import FeatureMap, external_identity, load_external_features
+from lexsplat.features import FeatureMap, check_external_features, external_identity, load_external_features
 from lexsplat.features.encoders import load_clip
 from lexsplat.pipeline.config import BuildConfig
 from lexsplat.runtime.errors import FileFormatError, MemoryBudgetError
@@ -262,6 +262,54 @@ def test_features_with_one_number_that_is_not_finite_are_reported_before_the_cam
     )
 
 
+@pytest.mark.parametrize("ending", [".npy", ".safetensors", "_f.npy"])
+@pytest.mark.parametrize(
+    ("value", "told"), [(np.nan, "NaN"), (0.0, "zeros alone"), (1e30, "beyond 1e19")], ids=str
+)
+def test_wrong_numbers_of_each_form_are_found_before_a_build_starts(
+    tiny_capture, segments, tmp_path, ending, value, told
+):
+    folder = shutil.copytree(segments, tmp_path / "maps")
+    for path in [] if ending == "_f.npy" else list(folder.glob("*_f.npy")):
+        stem = path.name.removesuffix("_f.npy")
+        array = np.full((9, 12, 128), value if stem == "view_03" else 1.0, np.float32)
+        path.unlink()
+        if ending == ".npy":
+            np.save(folder / f"{stem}.npy", array)
+        else:
+            save_file({"clip": torch.from_numpy(array)}, folder / f"{stem}.safetensors")
+    if ending == "_f.npy":
+        np.save(folder / "view_03_f.npy", np.full((4, 128), value, np.float32))
+    with pytest.raises(FileFormatError) as caught:
+        check_external_features(folder, load_capture(tiny_capture), 128)
+    assert_reports(caught.value, f"view_03{ending}", told)
+
+
+@pytest.mark.parametrize("form", ["depth", "square", "dino"])
+def test_tensors_of_another_depth_or_shape_are_found_before_a_build_starts(tiny_capture, tmp_path, form):
+    capture = load_capture(tiny_capture)
+    for name in capture.views:
+        tensors = {"clip": torch.ones(9, 9 if form == "square" else 12, 64 if form == "depth" else 128)}
+        tensors |= {"dino": torch.full((9, 12, 4), torch.nan)} if form == "dino" else {}
+        save_file(tensors, tmp_path / f"{Path(name).stem}.safetensors")
+    with pytest.raises(FileFormatError) as caught:
+        check_external_features(tmp_path, capture, 128)
+    told = {"depth": "found 64", "square": "the photo's aspect", "dino": "NaN"}[form]
+    assert_reports(caught.value, ".safetensors", told)
+
+
+def test_segment_numbers_are_read_before_a_build_starts(tiny_capture, segments, tmp_path):
+    folder, capture = shutil.copytree(segments, tmp_path / "segments"), load_capture(tiny_capture)
+    check_external_features(folder, capture, 128)
+    for path in folder.glob("*_s.npy"):
+        np.save(path, np.full((72, 96), -1))
+    with pytest.raises(FileFormatError, match="segments in some photo, found none in any"):
+        check_external_features(folder, capture, 128)
+    np.save(folder / "view_03_s.npy", np.full((72, 96), 4))
+    with pytest.raises(FileFormatError, match="integers from -1 to 3, found 4 to 4"):
+        check_external_features(folder, capture, 128)
+
+
 @pytest.mark.parametrize(
     ("numbers", "told"),
     [
@@ -269,6 +317,7 @@ def test_features_with_one_number_that_is_not_finite_are_reported_before_the_cam
         (np.full((72, 96), -2), "integers from -1 to 3, found -2 to -2"),
         (np.full((72, 96), 0.5), "integers from -1 to 3, found 0.5 to 0.5"),
         (np.full((72, 96), np.nan), "integer segment ids, found NaN"),
+        (np.full((72, 96), 2**40), "up to 2^31, found 1.09951e+12 to 1.09951e+12"),
     ],
 )
 def test_segments_with_wrong_numbers_are_refused_with_what_to_do(

@@ -179,13 +179,19 @@ def exact(tmp_path_factory) -> Path:
     return folder
 
 
+AGAIN = "write the map of segments again"
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
         (lambda path: path.unlink(), ["view_03.png, view_03.npy or view_03_s.npy", "none of them"]),
-        (lambda path: Image.new("L", (50, 50), 1).save(path), ["view_03.png", "96x72", "50x50"]),
+        (
+            lambda path: Image.new("L", (50, 50), 1).save(path),
+            ["view_03.png", "a map of segments of view_03.png, 96x72", "50x50", AGAIN],
+        ),
         (lambda path: Image.new("RGB", SIZE).save(path), ["view_03.png", "one number a pixel", "mode RGB"]),
-        (lambda path: path.write_text("none"), ["view_03.png", "an image"]),
+        (lambda path: path.write_text("none"), ["view_03.png", "an image", AGAIN]),
         (
             lambda path: (path.unlink(), np.save(path.with_suffix(".npy"), np.full((72, 96), 0.5))),
             ["view_03.npy", "integers", "0.5"],

@@ -5,6 +5,9 @@ from __future__ import annotations
 import logging
 import tokenize
 import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +30,7 @@ log = logging.getLogger("lexsplat")
 _FLOATS = ("F64", "F32", "F16", "BF16")
 
 _READ_FIRST = 1 << 24
-"""Bytes of an array that are read to find NaN before a build starts."""
+"""Bytes of an array that are read to find wrong numbers before a build starts."""
 
 
 def load_external_features(
@@ -90,7 +93,7 @@ def load_external_features(
 def check_external_features(folder: Path, capture: Capture, dimension: int | None = None) -> None:
     """Refuse arrays that are wrong by their headers or not finite, before anything that takes time.
 
-    Of a large .npy array only every so many rows are read here; the rest is checked on access, as other files are.
+    Of a large array only every so many rows are read here; the rest is checked on access.
 
     Args:
         folder: Folder of the arrays (`load_external_features`).
@@ -98,27 +101,15 @@ def check_external_features(folder: Path, capture: Capture, dimension: int | Non
         dimension: See `load_external_features`.
 
     Raises:
-        FileFormatError: If a view has no array, or one has a wrong shape or type, or NaN.
+        FileFormatError: If a view has no array, one has a wrong shape or type, numbers that are no features or
+            segments, or no photo has a segment.
     """
-    sources = external_sources(folder, capture)
+    sources, described = external_sources(folder, capture), False
     for name in capture.train_names:
         reading, path = _Reading(capture.views[name], budget.DEFAULT_MEMORY), sources[name]
-        if path.name.endswith("_f.npy"):
-            of_segments, _ = reading.open_segments(path)
-            _check_depth(of_segments.shape[1], dimension, path)
-            _check_finite(of_segments, path)
-        elif path.suffix == ".npy":
-            array = _open_features(path)
-            reading.check_aspect(array.shape, path)
-            _check_depth(array.shape[-1], dimension, path)
-            _check_finite(array, path)
-
-
-def _check_finite(array: NDArray, path: Path) -> None:
-    """Refuse NaN and infinity in the rows that fit `_READ_FIRST`."""
-    rows = array[:: 1 + array.nbytes // _READ_FIRST]
-    if not np.isfinite(rows).all():
-        raise wrong(path, "finite numbers", "NaN or infinity")
+        described |= reading.check(path, dimension)
+    if not described and capture.train_names:
+        raise _without_segments(folder)
 
 
 def read_external_features(maps: FeatureMaps, folder: Path, listener: Listener = silent) -> None:
@@ -137,10 +128,13 @@ def read_external_features(maps: FeatureMaps, folder: Path, listener: Listener =
         empty += not bool(maps[name].clip.any())
         listener(Event("features", done, len(maps)))
     if empty == len(maps):
-        expected, found = "segments in some photo", "none in any"
-        raise FileFormatError(folder, expected=expected, found=found, remedy="write them again")
+        raise _without_segments(folder)
     if empty:
         log.warning("%s: %d of %d photos have no segment, and so no features", folder, empty, len(maps))
+
+
+def _without_segments(folder: Path) -> FileFormatError:
+    return wrong(folder, "segments in some photo", "none in any", "write them again")
 
 
 def _check_depth(found: int, dimension: int | None, path: Path) -> None:
@@ -212,24 +206,37 @@ class _Reading:
             itemsize = 0 if array.dtype == np.float32 else array.itemsize
             rows, columns = self._cells(array.shape, itemsize, path)
             return FeatureMap(_unit(array[rows[:, None], columns], path))
-        from safetensors import SafetensorError, safe_open
-
-        try:
-            with safe_open(path, framework="pt") as file:
-                parts = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
-                for name, part in parts.items():
-                    if part.get_dtype() not in _FLOATS:
-                        raise wrong(path, f"{name} as floating-point numbers", part.get_dtype())
-                dino = parts.pop("dino", None)
-                if len(parts) != 1 and "clip" not in parts:
-                    raise wrong(path, 'a tensor "clip"', ", ".join(sorted(parts)) or "none")
-                clip = parts.get("clip", next(iter(parts.values())))
-                if dino is not None and dino.get_shape()[:2] != clip.get_shape()[:2]:
-                    raise wrong(path, f"dino of size {clip.get_shape()[:2]}", dino.get_shape()[:2])
-                made = [None if part is None else self._sliced(part, path) for part in (clip, dino)]
-        except (OSError, SafetensorError, ValueError, RuntimeError, OverflowError) as error:
-            raise wrong(path, "safetensors", error) from error
+        with _tensors(path) as (clip, dino):
+            made = [None if part is None else self._sliced(part, path) for part in (clip, dino)]
         return FeatureMap(*made)  # type: ignore[arg-type]
+
+    def check(self, path: Path, dimension: int | None) -> bool:
+        """Check headers and some rows of an array (`check_external_features`).
+
+        Returns:
+            Whether a pixel may have a feature: False if all have no segment.
+        """
+        if path.name.endswith("_f.npy"):
+            features, numbers = self.open_segments(path)
+            _check_depth(features.shape[1], dimension, path)
+            _check_rows(lambda step: features[None, ::step], features.nbytes, path)
+            step = 1 + numbers.nbytes // _READ_FIRST
+            some = segment_numbers(numbers[..., ::step, :], _segments_of(path), len(features))
+            return step > 1 or bool((some >= 0).any())
+        if path.suffix == ".npy":
+            array = _open_features(path)
+            self.check_aspect(array.shape, path)
+            _check_depth(array.shape[-1], dimension, path)
+            _check_rows(lambda step: array[::step], array.nbytes, path)
+            return True
+        with _tensors(path) as (clip, dino):
+            for part in (clip,) if dino is None else (clip, dino):
+                height, width, depth = self.check_aspect(tuple(part.get_shape()), path)
+                if part is clip:
+                    _check_depth(depth, dimension, path)
+                read = partial(_rows_of, part, height)
+                _check_rows(read, 4 * height * width * depth, path)
+        return True
 
     def _sliced(self, part: Any, path: Path) -> torch.Tensor:
         """Unit vectors of a slice of a safetensors file, row by row: only one row is held twice."""
@@ -261,11 +268,11 @@ class _Reading:
         self.check_aspect((*numbers.shape[-2:], features.shape[1]), pixels)
         return features, numbers
 
-    def check_aspect(self, shape: tuple[int, ...], path: Path) -> None:
-        """Refuse an array ``[h, w, D]`` of another shape, or without the photo's aspect."""
+    def check_aspect(self, shape: tuple[int, ...], path: Path) -> tuple[int, int, int]:
+        """The shape of an array ``[h, w, D]``; another one, or one without the photo's aspect, is refused."""
         if len(shape) != 3 or 0 in shape:
             raise wrong(path, "features [h, w, D]", list(shape))
-        height, width, _ = shape
+        height, width, depth = shape
         if height == width == 1:
             raise wrong(path, "a map of the photo", "one feature for all of it", "give features of its parts")
         photo_width, photo_height = self.view.capture_size
@@ -277,19 +284,58 @@ class _Reading:
                 f"{width}x{height}",
                 "give features of the whole photo",
             )
+        return height, width, depth
 
     def _cells(
         self, shape: tuple[int, ...], itemsize: int, path: Path
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows and columns to read of an array ``[h, w, D]``."""
-        self.check_aspect(shape, path)
-        height, width, depth = shape
+        height, width, depth = self.check_aspect(shape, path)
         rows, columns = min(height, self.view.camera.height), min(width, self.view.camera.width)
         # The map, and its source or its norms and a row.
         need = rows * columns * (depth * (4 + itemsize) + 16) + (16 << 20)
         what = f"features of {columns}x{rows}x{depth} of a view"
         budget.require("features", need, self.memory, what, "a larger --downscale")
         return _centers(rows, height), _centers(columns, width)
+
+
+@contextmanager
+def _tensors(path: Path) -> Iterator[tuple[Any, Any]]:
+    """The slices "clip" and "dino" (or None) of a safetensors file; what fails while they are read names the file."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            parts = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
+            for name, part in parts.items():
+                if part.get_dtype() not in _FLOATS:
+                    raise wrong(path, f"{name} as floating-point numbers", part.get_dtype())
+            dino = parts.pop("dino", None)
+            if len(parts) != 1 and "clip" not in parts:
+                raise wrong(path, 'a tensor "clip"', ", ".join(sorted(parts)) or "none")
+            clip = parts.get("clip", next(iter(parts.values())))
+            if dino is not None and dino.get_shape()[:2] != clip.get_shape()[:2]:
+                raise wrong(path, f"dino of size {clip.get_shape()[:2]}", dino.get_shape()[:2])
+            yield clip, dino
+    except (OSError, SafetensorError, ValueError, RuntimeError, OverflowError) as error:
+        raise wrong(path, "safetensors", error) from error
+
+
+def _rows_of(part: Any, height: int, step: int) -> NDArray:
+    """Every so many rows of a slice of a safetensors file."""
+    return np.concatenate([part[row : row + 1].float().numpy() for row in range(0, height, step)])
+
+
+def _check_rows(read: Callable[[int], NDArray], size: int, path: Path) -> None:
+    """Refuse rows of features that are not finite or, if all are read, zeros alone.
+
+    Args:
+        read: Every so many rows of an array.
+        size: Bytes of the array; about `_READ_FIRST` of them are read.
+        path: Its file.
+    """
+    step = 1 + size // _READ_FIRST
+    _unit(np.array(read(step), np.float32), path, holes=step > 1)
 
 
 def _centers(count: int, length: int) -> NDArray[np.intp]:
@@ -303,8 +349,10 @@ def segment_numbers(segments: NDArray, path: Path, count: int = 1 << 31) -> NDAr
     Raises:
         FileFormatError: If they are others.
     """
-    if not np.isfinite(segments).all() or np.abs(segments.astype(np.float64)).max() > 2**31:
-        raise wrong(path, "integer segment ids", "NaN, infinity or values beyond 2^31")
+    if not np.isfinite(segments).all():
+        raise wrong(path, "integer segment ids", "NaN or infinity")
+    if np.abs(segments.astype(np.float64)).max() > 2**31:
+        raise wrong(path, "integer segment ids up to 2^31", f"{segments.min():g} to {segments.max():g}")
     index = segments.astype(np.int64)
     if index.min() < -1 or index.max() >= count or (index != segments).any():
         raise wrong(path, f"integers from -1 to {count - 1}", f"{segments.min():g} to {segments.max():g}")
@@ -361,7 +409,8 @@ def _unit(array: NDArray, path: Path, *, holes: bool = False) -> torch.Tensor:
         values = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
     lengths = torch.linalg.vector_norm(values, dim=-1, keepdim=True)
     if not bool(torch.isfinite(lengths).all()):
-        raise wrong(path, "finite numbers", "NaN, infinity, or values beyond 1e19")
+        finite = bool(np.isfinite(array).all())
+        raise wrong(path, "finite numbers", "values beyond 1e19" if finite else "NaN or infinity")
     if not holes and not bool(lengths.any()):
         raise wrong(path, "features", "zeros alone")
     return values.div_(lengths.clamp_min(1e-12))

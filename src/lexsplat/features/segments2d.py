@@ -24,7 +24,7 @@ from lexsplat.features.external import open_npy, segment_numbers, wrong
 from lexsplat.features.extraction import pixels_hash, reduced, size_of_map
 from lexsplat.features.hub import model_folder
 from lexsplat.features.settings import FeatureConfig
-from lexsplat.runtime.errors import ModelError
+from lexsplat.runtime.errors import CaptureError, ModelError
 from lexsplat.runtime.fingerprints import file_hash
 from lexsplat.runtime.progress import Event, FirstUnits, Listener, silent
 
@@ -167,6 +167,14 @@ class SegmentFolder:
             CaptureError: If it cannot be read, or does not have the photo's aspect.
         """
         path = self.path(view)
+        try:
+            return self._labels(path, view, size)
+        except CaptureError as error:  # its remedies are those of photos and masks
+            remedy = "write the map of segments again (docs/captures.md has the layout)"
+            expected = error.expected.replace("a mask of", "a map of segments of")
+            raise CaptureError(path, expected=expected, found=error.found, remedy=remedy) from error
+
+    def _labels(self, path: Path, view: View, size: tuple[int, int]) -> NDArray[np.int32]:
         if path.suffix == ".png":
             levels = _png_numbers(path)[None]
         else:
