@@ -55,16 +55,18 @@ def test_patches_without_content_are_found_where_class_tokens_are_right(monkeypa
         check_words(clip, patches=True)
 
 
-@pytest.mark.parametrize("same", [True, False], ids=["of this encoder", "of another"])
-def test_features_of_another_encoder_are_told_though_they_have_the_depth(tmp_path, caplog, same):
+@pytest.mark.parametrize("change", ["none", "another encoder", "reversed channels", "mirrored"])
+def test_features_that_do_not_match_the_photos_are_told_though_they_have_the_depth(tmp_path, caplog, change):
     capture, encoders = load_capture(CAPTURE), Encoders("bundled", "none", "cpu")
-    turned = torch.eye(encoders.clip.dim) if same else rotation(encoders.clip.dim)
+    turned = rotation(encoders.clip.dim) if change == "another encoder" else torch.eye(encoders.clip.dim)
     for view in capture.views.values():
         photo = torch.from_numpy(view.load_image((160, 120))).permute(2, 0, 1)
         tiles = photo.unfold(1, 40, 40).unfold(2, 40, 40).permute(1, 2, 0, 3, 4)  # 3 rows of 4
         tokens = encoders.clip.encode_images(tiles.flatten(0, 1)) @ turned
-        np.save(tmp_path / f"{view.stem}.npy", tokens.reshape(3, 4, -1).numpy())
+        tokens = tokens.reshape(3, 4, -1)
+        flipped = {"reversed channels": tokens.flip(2), "mirrored": tokens.flip(1)}.get(change, tokens)
+        np.save(tmp_path / f"{view.stem}.npy", flipped.numpy())
     config = BuildConfig(clip="bundled", dino="none", features_from=tmp_path)
     with caplog.at_level(logging.WARNING, logger="lexsplat"):
         check_given(config, capture, encoders)
-    assert ("of another encoder, which --clip has to name" in caplog.text) is not same
+    assert ("of another encoder, which --clip has to name" in caplog.text) is (change != "none")

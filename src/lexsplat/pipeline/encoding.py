@@ -18,7 +18,7 @@ from lexsplat.features import (
     load_external_features,
 )
 from lexsplat.features.cache import without_masked_cells
-from lexsplat.features.checks import ENOUGH, check_dense, rank_tiles, rank_words
+from lexsplat.features.checks import ENOUGH, ENOUGH_TILES, check_dense, rank_tiles, rank_words
 from lexsplat.features.clip import check_patches
 from lexsplat.features.clip_text import UNLIKE_WORDS
 from lexsplat.features.estimate import Estimate, estimate
@@ -208,14 +208,14 @@ def check_given(config: BuildConfig, capture: Capture | None, encoders: Encoders
         (torch.from_numpy(image).permute(2, 0, 1) for image in images),
         (maps[name].clip for name in names),
     )
-    if right < ENOUGH:
+    if right < ENOUGH_TILES:
         log.warning(
             "%s: the features match what %s sees in the photos by %.2f only (expected %.2f, chance 0.50); "
             "words have no meaning in features of another encoder, which --clip has to name",
             folder,
             f"--clip {config.clip}",
             right,
-            ENOUGH,
+            ENOUGH_TILES,
         )
 
 
