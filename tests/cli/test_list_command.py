@@ -100,6 +100,13 @@ def test_a_name_in_another_case_is_the_same_name_in_its_first_spelling(demo, tmp
     assert list_document(demo, ["mug", "MUG"])["words"] == 1
 
 
+def test_a_vocabulary_of_few_names_is_told_to_call_things_by_the_nearest_one(demo):
+    few = list_document(demo, ["apple", "mug"])
+    assert [each["name"] for each in few["objects"]].count("apple") > 1, "the banana is one, too"
+    assert "few names" in few["note"]
+    assert list_document(demo)["note"] == ""
+
+
 @pytest.mark.slow
 def test_thumbnails_show_the_objects_and_dim_what_is_around(demo, tmp_path):
     document = list_document(demo, (), tmp_path / "new" / "sheet.png")

@@ -51,6 +51,8 @@ _MAX_BYTES = 1 << 20
 _MAX_LENGTH = 120
 _NAMES = 3
 _LEAST_PROBABILITY = 0.01
+_FEW_NAMES = 20
+"""Names below which a banana may well be listed as an "apple"."""
 _SEEN = 1.0
 """Pixels of all views from which a Gaussian of a surface tells its height and color."""
 _MOST = 0.35
@@ -316,6 +318,12 @@ def list_document(
         picture: File of the sheet of thumbnails; None writes none.
     """
     things = scene.objects if not vocabulary else objects_of(scene, vocabulary)
+    names = len(distinct_names(vocabulary))
+    notes = [] if scene.field.segments else [f"no segments: each word is looked for; {NO_SEGMENTS}"]
+    if 0 < names < _FEW_NAMES:
+        notes.append(
+            "few names: a thing without its own name gets the one that fits it best; add names of other things"
+        )
     find_best_views(scene, things)
     if picture is not None:
         write_sheet(scene, things, picture)
@@ -323,8 +331,8 @@ def list_document(
         "scene": str(scene.folder.root) if scene.folder else None,
         "rests_on": rests_on(scene),
         **scene.world.to_json(),
-        "words": len(distinct_names(vocabulary)) or len(default_vocabulary(scene.clip)),
-        "note": "" if scene.field.segments else f"no segments: each word is looked for; {NO_SEGMENTS}",
+        "words": names or len(default_vocabulary(scene.clip)),
+        "note": "; ".join(notes),
         "picture": None if picture is None else str(picture),
         "objects": [_entry(scene, thing) for thing in things],
     }
