@@ -10,13 +10,15 @@ import torch
 
 from lexsplat import cli
 from lexsplat.queries.colors import is_qualified, unqualified, without_color
+from lexsplat.queries.selection import union
+from lexsplat.queries.thresholds import BORDER
 from lexsplat.queries.vocabulary import default_vocabulary
 from lexsplat.runtime.errors import QueryError
 from lexsplat.scenes.editing import Editor
 from lexsplat.scenes.listed import listed_as, refuse_doubtful
 from lexsplat.scenes.objects import objects_of, with_pieces_apart, with_renamed
 from lexsplat.scenes.scene import Scene, open_scene
-from lexsplat.scenes.words import of_color_told
+from lexsplat.scenes.words import Word, completed, of_color_told
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +125,29 @@ def test_a_name_takes_the_whole_object_that_is_listed_under_it(demo, phrase):
     """The gap between the scores of segments is widest within the books, which have three colors."""
     (thing,) = listed_as(demo, phrase)
     assert bool(demo.ask(phrase).chosen(0)[thing.indices].all())
+
+
+@pytest.mark.parametrize(
+    ("prompt", "likely", "keeps"),
+    [("red apple", (), False), ("red apple", (("pumpkin", 0.6), ("apple", 0.3)), True), ("table", (), False)],
+    ids=["a stranger", "perhaps an apple, too", "a surface"],
+)
+def test_a_word_leaves_things_that_its_noun_is_no_name_of_and_what_is_no_object(
+    demo, monkeypatch, prompt, likely, keeps
+):
+    named, pumpkin = listed(demo, prompt.split()[-1]), listed(demo, "pumpkin")
+    other = pumpkin.described(names=likely or pumpkin.names)
+    objects = tuple(other if each is pumpkin else each for each in demo.objects)
+    monkeypatch.setattr(demo, "_objects", objects)
+    unlisted = ~demo.hidden & ~union(demo.hidden, demo.objects)
+    taken = named.mask | pumpkin.mask | unlisted
+    word = completed(demo, prompt, Word(taken.float(), taken.float(), "yes"))
+    left = word.scores >= BORDER
+    assert bool(left[named.indices].all())
+    assert bool(left[pumpkin.indices].all()) is keeps
+    assert not left[pumpkin.indices].any() or keeps
+    assert int(unlisted.sum()) > 50
+    assert bool(left[unlisted].any()) is (prompt == "table"), "few views show all of a surface"
 
 
 def test_an_edit_of_what_is_listed_as_something_else_is_refused(demo):

@@ -66,9 +66,13 @@ export class Kinds {
 
   /**
    * Scores with all of each of some objects of which much is taken, and without the little that is taken of other
-   * things (completed in lexsplat.scenes.words).
+   * things, much of things that no noun names, and what is no object (completed in lexsplat.scenes.words).
+   * `isSurface` tells surfaces, `carries` those of them that carry things.
    */
-  completed(scores: Float32Array, taken: number[], named: number[], isSurface: (name: string) => boolean): Float32Array {
+  completed(
+    scores: Float32Array, taken: number[], named: number[], nouns: string[],
+    isSurface: (name: string) => boolean, carries: (name: string) => boolean,
+  ): Float32Array {
     this.#places ??= this.#found();
     const isTaken = new Set(taken);
     const isMuch = (splats: number[]): boolean => splats.length > 0 && splats.filter((i) => isTaken.has(i)).length >= PIECE * splats.length;
@@ -79,10 +83,18 @@ export class Kinds {
     for (const place of found) {
       for (const i of this.#places[place].splats) if (!isTaken.has(i)) result[i] = Math.max(result[i], MEMBER);
     }
-    this.#places.forEach(({ splats }, place) => {
-      if (named.includes(place) || isSurface(this.#objects[place].name) || isMuch(splats)) return;
+    const leave = (splats: number[]): void => {
       for (const i of splats) if (isTaken.has(i)) result[i] = Math.min(result[i], border);
+    };
+    this.#places.forEach(({ splats }, place) => {
+      const { name, nouns: own } = this.#objects[place];
+      if (named.includes(place)) return;
+      const isStranger = own !== undefined && !isSurface(name) && !own.some((noun) => nouns.includes(noun));
+      if (isMuch(splats) ? isStranger : !isSurface(name) || carries(name)) leave(splats);
     });
+    if (!found.some((place) => isSurface(this.#objects[place].name))) {
+      leave(taken.filter((i) => this.content[i] >= this.#objects.length));
+    }
     return result;
   }
 

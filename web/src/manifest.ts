@@ -160,6 +160,8 @@ export interface ObjectEntry {
   colors?: string[];
   /** Every color that it is seen in. */
   seen_colors?: string[];
+  /** Nouns of its likeliest names. */
+  nouns?: string[];
 }
 
 export interface Manifest {

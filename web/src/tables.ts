@@ -246,8 +246,8 @@ export class Tables implements Source {
         if (grammar.has("stuff", name)) return false;
         return name === phrase.toLowerCase() || !this.#isQualified(phrase) || this.kinds.isMostly(place, splats, masses);
       });
-      const isSurface = (name: string): boolean => grammar.has("surfaces", name) && !grammar.has("carriers", name);
-      scores = this.kinds.completed(scores, splats, named, isSurface);
+      const [isSurface, carries] = ["surfaces", "carriers"].map((list) => (name: string): boolean => grammar.has(list, name));
+      scores = this.kinds.completed(scores, splats, named, singulars(noun), isSurface, carries);
     }
     return { scores, own, ...parts, presence: presence === "yes" && !sure ? ("unsure" as const) : presence, threshold };
   }

@@ -40,11 +40,13 @@ def noun_of(phrase: str) -> str:
     return singular((thing_of_part(phrase) or phrase).lower().strip().split(" of ")[0].split()[-1])
 
 
+def nouns_of(name: str) -> set[str]:
+    """The nouns of a name; of "stack of books" both."""
+    return {noun_of(name), noun_of(name.split()[-1])}
+
+
 def _nouns(objects: Sequence[Selection]) -> frozenset[str]:
-    """The nouns of names; of "stack of books" both."""
-    return frozenset(
-        noun for each in objects for noun in (noun_of(each.phrase), noun_of(each.phrase.split()[-1]))
-    )
+    return frozenset(noun for each in objects for noun in nouns_of(each.phrase))
 
 
 def _is_text(value: object) -> bool:

@@ -15,10 +15,9 @@ from lexsplat.queries.colors import colors_expected, unqualified, without_color
 from lexsplat.queries.parts import HELD
 from lexsplat.queries.phrases import Except, Phrase, Thing, parts_of
 from lexsplat.queries.selection import Selection
-from lexsplat.queries.spelling import singular
 from lexsplat.queries.vocabulary import COLORS, is_part, is_part_alone
 from lexsplat.runtime.errors import QueryError
-from lexsplat.scenes.gone import noun_of
+from lexsplat.scenes.gone import noun_of, nouns_of
 from lexsplat.scenes.pixels import object_colors
 
 if TYPE_CHECKING:
@@ -43,7 +42,7 @@ def mainly(scene: Scene, taken: Tensor) -> list[Selection]:
 
 def listed_under(scene: Scene, noun: str) -> list[Selection]:
     """The objects of a scene whose names have a noun."""
-    return [each for each in scene.objects if noun in _nouns(each)]
+    return [each for each in scene.objects if noun in nouns_of(each.phrase)]
 
 
 def listed_as(scene: Scene, phrase: str) -> list[Selection]:
@@ -135,11 +134,6 @@ def _targets(phrase: Phrase) -> list[str]:
         return _targets(parts["target"])
     kept = [parts["first"]] if isinstance(phrase, Except) else list(parts.values())
     return [text for part in kept for text in _targets(part)]
-
-
-def _nouns(thing: Selection) -> set[str]:
-    """The nouns of an object's name: of "stack of books" both."""
-    return {noun_of(thing.phrase), singular(thing.phrase.split()[-1])}
 
 
 def _and(names: Iterable[str]) -> str:

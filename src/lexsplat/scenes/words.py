@@ -36,7 +36,7 @@ from lexsplat.queries.vocabulary import (
 )
 from lexsplat.runtime.device import threads_for_kernels
 from lexsplat.runtime.fingerprints import digest
-from lexsplat.scenes.gone import gone_nouns, noun_of
+from lexsplat.scenes.gone import gone_nouns, noun_of, nouns_of
 from lexsplat.scenes.listed import doubt, holding, listed_as, listed_under
 from lexsplat.scenes.pixels import object_colors, seen_colors
 
@@ -139,8 +139,8 @@ def completed(scene: Scene, prompt: str, word: Word) -> Word:
     """The word with all of each object of its name of which it takes at least `_PIECE`.
 
     The widest gap between the scores of segments may lie within a thing of many looks, such as a stack of books. The
-    list of objects knows its other segments by name: no other word describes them better. So it knows those of other
-    things, of which the word takes a little.
+    list of objects knows its other segments by name: no other word describes them better. So it knows what the word
+    takes too much: a little of other things, a green bowl beside a green apple, and what is no object at all.
     """
     if word.presence != "yes" or word.members or form_used(scene.field, scene.query) != "segment":
         return word
@@ -157,9 +157,16 @@ def completed(scene: Scene, prompt: str, word: Word) -> Word:
     if not found:
         return word
     whole = union(taken, found)
-    others = [each for each in scene.objects if each not in named and _is_scrap(each, taken)]
+    others = [
+        each
+        for each in scene.objects
+        if each not in named and (_is_scrap(each, taken) or _is_stranger(each, taken, noun_of(prompt)))
+    ]
+    left = union(taken, others)
+    if not any(each.phrase in SURFACES for each in found):  # a table is listed without what few views show
+        left |= ~union(taken, scene.objects)
     scores = torch.where(whole & ~taken, word.scores.clamp(min=MEMBER), word.scores)
-    scores = torch.where(union(taken, others) & taken, scores.clamp(max=BORDER - 1e-4), scores)
+    scores = torch.where(left & taken & ~whole, scores.clamp(max=BORDER - 1e-4), scores)
     return replace(word, scores=scores)
 
 
@@ -175,6 +182,18 @@ def _is_scrap(other: Selection, taken: Tensor) -> bool:
     """Whether a word takes a little of another thing, such as the upper edge of the books before a lamp."""
     known = other.phrase not in SURFACES or other.phrase in CARRIERS
     return known and 0 < int(taken[other.indices].sum()) < _PIECE * len(other)
+
+
+def _is_stranger(other: Selection, taken: Tensor, noun: str) -> bool:
+    """Whether a word takes much of another thing that its noun is no likely name of."""
+    if other.phrase in SURFACES or noun in likely_nouns(other):
+        return False
+    return int(taken[other.indices].sum()) >= _PIECE * len(other)
+
+
+def likely_nouns(thing: Selection) -> set[str]:
+    """The nouns of the likeliest names of an object."""
+    return {noun for name in (thing.phrase, *(name for name, _ in thing.names)) for noun in nouns_of(name)}
 
 
 def of_part(scene: Scene, prompt: str, word: Word) -> Word:

@@ -18,6 +18,7 @@ from lexsplat.scenes.pixels import object_colors, seen_colors
 from lexsplat.scenes.publishing.grammar import page_grammar
 from lexsplat.scenes.publishing.rules import selection_rule
 from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.words import likely_nouns
 
 FORMAT, FORMAT_VERSION = "lexsplat-page", 8
 DRAWN_SPLATS = 1_000_000
@@ -97,9 +98,14 @@ def object_entries(objects: Sequence[Selection]) -> list[dict[str, Any]]:
 
 
 def colored_entries(scene: Scene, objects: Sequence[Selection]) -> list[dict[str, Any]]:
-    """`object_entries` with "colors", the color words of each object, the most frequent first, and "seen_colors"."""
+    """`object_entries` with "colors" (the most frequent first), "seen_colors" and "nouns" (of likely names)."""
     return [
-        {**entry, "colors": object_colors(scene, each), "seen_colors": seen_colors(scene, each)}
+        {
+            **entry,
+            "colors": object_colors(scene, each),
+            "seen_colors": seen_colors(scene, each),
+            "nouns": sorted(likely_nouns(each)),
+        }
         for entry, each in zip(object_entries(objects), objects)
     ]
 
