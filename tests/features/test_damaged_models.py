@@ -208,6 +208,43 @@ def test_json_that_is_no_tokenizer_is_refused_by_its_name(clip_copy, content):
     assert "added_tokens'" not in message
 
 
+def change_json(path: Path, change) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("number", "found"),
+    [
+        (99_999, "token 'banknote</w>' with the number 99999"),
+        (1638, "token 'banknote</w>' with the number 1638"),
+        (7, "the number 7 for both "),
+        (-1, "-1"),
+    ],
+)
+def test_a_token_without_a_row_of_its_own_in_the_model_is_refused_by_every_loader(clip_copy, number, found):
+    """The model would be built with, and the first question with that word would fail."""
+    path = clip_copy / "tokenizer.json"
+
+    def moved(content: dict) -> None:
+        content["model"]["vocab"]["banknote</w>"] = number
+
+    change_json(path, moved)
+    for load in (load_clip, load_text):
+        refused(clip_copy, f"{path}: expected ", found, "; fetch the model again", load=load)
+
+
+def test_a_start_of_prompts_without_a_row_in_the_model_is_not_taken_as_it_is(clip_copy, clip_folder):
+    change_json(
+        clip_copy / "tokenizer.json",
+        lambda content: content["post_processor"].update(cls=["<|startoftext|>", 99_999]),
+    )
+    for load in (load_clip, load_text):  # transformers adds the start itself
+        found, expected = (load(str(each)).encode_text(["a car"]) for each in (clip_copy, clip_folder))
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
 # -- the text tower
 
 

@@ -21,6 +21,7 @@ from lexsplat.features.clip_text import (
     ClipText,
     is_vocabulary,
     light_tower,
+    misnumbered,
     warn_truncated,
 )
 from lexsplat.features.hub import local_folder, tokenizer_files
@@ -268,6 +269,14 @@ def _load_tokenizer(folder: Path, name: str, config: Any) -> Any:
             expected=f"a tokenizer with the {size:,} words of the model",
             found=f"{len(tokenizer):,} words",
             remedy=f"fetch the model again with its tokenizer files; they are read from {folder}",
+        )
+    fault = misnumbered(tokenizer.get_vocab(), tokenizer(UNLIKE_WORDS[0])["input_ids"], size)
+    if fault:
+        raise ModelError(
+            tokenizer_files(folder)[0],
+            expected=f"another number below {size} for each token (vocab_size in config.json)",
+            found=fault,
+            remedy="fetch the model again with its tokenizer files",
         )
     return tokenizer
 
