@@ -171,6 +171,53 @@ def test_pickled_weights_that_are_not_tensors_are_refused_in_words_of_lexsplat(
     assert not [one for one in recwarn if "pickle" in str(one.message)]
 
 
+# -- weights that are not plain floats
+
+WEIGHT = "vision_model.encoder.layers.0.mlp.fc1.weight"
+
+
+def rewritten(folder: Path, change) -> Path:
+    """The folder with ``change`` of its tensors."""
+    path = folder / "model.safetensors"
+    save_file(change(load_file(path)), path, {"format": "pt"})
+    return folder
+
+
+@pytest.mark.parametrize(
+    "dtype",
+    [torch.int8, torch.uint8, torch.int32, torch.bool, torch.float8_e4m3fn, torch.complex64],
+    ids=lambda dtype: str(dtype).removeprefix("torch."),
+)
+def test_quantized_weights_are_refused_with_their_type_and_name(clip_copy, vit_folder, tmp_path, dtype):
+    """Their scales are not read, so that they would be other weights."""
+    found = f"model.safetensors: expected weights in float16, bfloat16, float32 or float64, found {dtype}"
+    found, remedy = found.replace("torch.", ""), "; fetch the float version of the model"
+    rewritten(clip_copy, lambda state: state | {WEIGHT: (state[WEIGHT] * 99).to(dtype)})
+    for load in (load_clip, load_text):
+        refused(clip_copy, f"{found} in {WEIGHT}{remedy}", load=load)
+    vit = shutil.copytree(vit_folder, tmp_path / "vit")
+    rewritten(vit, lambda state: {key: value.to(dtype) for key, value in state.items()})
+    refused(vit, f"{found} in ", remedy, load=load_dino)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_weights_in_other_floats_and_places_in_whole_numbers_load(clip_copy, clip_folder, dtype):
+    places = {
+        f"{tower}_model.embeddings.position_ids": torch.arange(26)[None] for tower in ("text", "vision")
+    }
+    rewritten(clip_copy, lambda state: {key: value.to(dtype) for key, value in state.items()} | places)
+    found, expected = (load_clip(str(each)).encode_text(["a car"]) for each in (clip_copy, clip_folder))
+    assert float((found * expected).sum()) > 0.99
+
+
+def test_sparse_weights_are_refused_by_the_name_of_a_tensor(clip_copy):
+    state = load_file(clip_copy / "model.safetensors")
+    pickled(clip_copy, state | {WEIGHT: state[WEIGHT].to_sparse()})
+    found = f"or float64, found sparse_coo in {WEIGHT};"
+    for load in (load_clip, load_text):
+        refused(clip_copy, "pytorch_model.bin: expected weights", found, "dense", load=load)
+
+
 # -- configuration and tokenizer
 
 

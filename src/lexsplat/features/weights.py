@@ -6,7 +6,7 @@ import contextlib
 import logging
 import re
 import warnings
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,12 @@ _VIT_NAMES = (
 )
 """Names of timm and of the original DINO, and what transformers calls them."""
 
+_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_WHOLE_NUMBERS = re.compile(
+    r"((^|[._])(ids|index|mask)|num_batches_tracked|input_resolution|context_length|vocab_size)$"
+)
+"""Names of tensors that are no weights: places, masks, counts."""
+
 
 def first_weights(names: Collection[str]) -> str | None:
     """The file of `WEIGHTS` that is read, among the names of a folder's files; None if there is none."""
@@ -101,12 +107,31 @@ def load_weights(folder: Path, name: str) -> dict[str, Tensor]:
         name: Name of the model in messages.
 
     Raises:
-        ModelError: If a file is damaged or holds anything but tensors.
+        ModelError: If a file is damaged, holds anything but tensors, or weights that are not plain floats.
     """
     state: dict[str, Tensor] = {}
     for path in weight_files(folder):
-        state.update(_pickled(path, name) if path.suffix == ".bin" else _safetensors(path, name))
+        found = _pickled(path, name) if path.suffix == ".bin" else _safetensors(path, name)
+        _check_floats(path, name, found)
+        state.update(found)
     return in_transformers_names(state)
+
+
+def _check_floats(path: Path, name: str, tensors: Mapping[str, Tensor]) -> None:
+    """Refuse quantized and sparse weights, which would be read as other numbers than they stand for."""
+    for key, tensor in tensors.items():
+        dense = tensor.layout == torch.strided
+        if dense and (tensor.dtype in _FLOATS or _WHOLE_NUMBERS.search(key)):
+            continue
+        found = str(tensor.dtype if dense else tensor.layout).removeprefix("torch.")
+        raise ModelError(
+            f"model {name}: {path.name}",
+            expected="weights in float16, bfloat16, float32 or float64",
+            found=f"{found} in {key}",
+            remedy="fetch the float version of the model in place of a quantized one"
+            if dense
+            else f"write it with dense tensors: {key}.to_dense()",
+        )
 
 
 def _safetensors(path: Path, name: str) -> dict[str, Tensor]:
