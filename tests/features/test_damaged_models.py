@@ -240,6 +240,69 @@ def test_a_damaged_configuration_is_refused_by_its_name(clip_copy, vit_folder, t
         refused(folder, expected, "fetch the model again", load=load)
 
 
+def change_json(path: Path, change) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def with_setting(folder: Path, place: str, value) -> Path:
+    """The ``config.json`` of a folder with a setting such as "vision_config.patch_size"; None takes it away."""
+    path, (*parts, key) = folder / "config.json", place.split(".")
+
+    def changed(content: dict) -> None:
+        for part in parts:
+            content = content[part]
+        content[key] = value
+        if value is None:
+            del content[key]
+
+    change_json(path, changed)
+    return path
+
+
+@pytest.mark.parametrize("value", [0, -4, "4", 2.5, True, [], [40, 0], HUGE, 1_000_000_000])
+def test_a_size_that_is_not_a_number_from_1_is_refused_by_its_place(clip_copy, value):
+    path = with_setting(clip_copy, "vision_config.num_attention_heads", value)
+    expected = (
+        f"{path}: vision_config.num_attention_heads: expected a whole number from 1 to 1,048,576, found "
+    )
+    refused(clip_copy, f"{expected}{json.dumps(value)}"[:200], "; fetch config.json again")
+
+
+@pytest.mark.parametrize("value", [0, -1, 1_000_000])
+@pytest.mark.parametrize("place", ["text_config.num_hidden_layers", "vision_config.num_hidden_layers"])
+def test_no_layers_and_a_million_layers_are_refused_before_they_are_built(clip_copy, place, value):
+    path = with_setting(clip_copy, place, value)
+    refused(clip_copy, f"{path}: {place}: expected a whole number from 1 to 256, found {value};")
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "text_config.hidden_size", "text_config.vocab_size", "text_config.max_position_embeddings",
+        "text_config.intermediate_size", "text_config.num_attention_heads", "vision_config.hidden_size",
+        "vision_config.patch_size", "vision_config.image_size", "vision_config.num_channels", "projection_dim",
+    ],
+)  # fmt: skip
+def test_sizes_of_every_kind_are_refused_at_0_and_below(clip_copy, place):
+    for value in (0, -8):
+        path = with_setting(clip_copy, place, value)
+        refused(clip_copy, f"{path}: {place}: expected a whole number from 1 to", f", found {value};")
+
+
+@pytest.mark.parametrize("key", ["patch_size", "image_size", "num_hidden_layers", "num_attention_heads"])
+def test_sizes_of_a_vision_transformer_are_refused_at_0(vit_folder, tmp_path, key):
+    path = with_setting(shutil.copytree(vit_folder, tmp_path / "vit"), key, 0)
+    refused(path.parent, f"{path}: {key}: expected a whole number from 1", "found 0;", load=load_dino)
+
+
+@pytest.mark.parametrize("value", [-1.0, float("nan"), 1e9, "1e-5", HUGE])
+def test_an_epsilon_that_norms_cannot_have_is_refused(clip_copy, value):
+    path = with_setting(clip_copy, "text_config.layer_norm_eps", value)
+    refused(clip_copy, f"{path}: text_config.layer_norm_eps: expected a number from 0 to 1, found ")
+
+
 @pytest.mark.parametrize("name", ["tokenizer.json", "tokenizer_config.json", "special_tokens_map.json"])
 @pytest.mark.parametrize(("content", "found"), [("", "Expecting value"), ("[]", "a list"), ("null", "null")])
 def test_a_damaged_file_of_the_tokenizer_is_refused_by_its_name(clip_copy, name, content, found):
@@ -253,12 +316,6 @@ def test_json_that_is_no_tokenizer_is_refused_by_its_name(clip_copy, content):
     (clip_copy / "tokenizer.json").write_text(content)
     message = refused(clip_copy, f"{clip_copy / 'tokenizer.json'}: expected a tokenizer, found other content")
     assert "added_tokens'" not in message
-
-
-def change_json(path: Path, change) -> None:
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
 
 
 @pytest.mark.parametrize(

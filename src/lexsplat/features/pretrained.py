@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import logging
 import math
 import time
@@ -20,8 +19,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lexsplat.features.declared_sizes import check_sizes
 from lexsplat.features.hub import content_hash, preprocessing, preprocessing_file
-from lexsplat.features.weights import build_model
+from lexsplat.features.weights import build_model, excerpt
 from lexsplat.runtime.device import one_thread
 from lexsplat.runtime.errors import ModelError
 
@@ -43,7 +43,7 @@ class PretrainedModel:
         device: Device of the model.
 
     Raises:
-        ModelError: If neither can load the folder, or a weight is missing.
+        ModelError: If neither can load the folder, a weight is missing, or ``config.json`` has sizes of no model.
     """
 
     tower: ClassVar[str]
@@ -53,6 +53,7 @@ class PretrainedModel:
 
     def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
         self.name, self.device = name, torch.device(device)
+        check_sizes(folder)
         self.content_hash = content_hash(folder, self.tower)
         model = self._own_model(folder)
         if model is None:
@@ -161,7 +162,7 @@ def normalization(folder: Path, default: tuple, device: torch.device) -> tuple[T
         raise ModelError(
             f"{preprocessing_file(folder)}: {key}",
             expected="three finite numbers" + (" above 0" if key == "image_std" else ""),
-            found=_excerpt(given[key]),
+            found=excerpt(given[key]),
             remedy="fetch the model again",
         )
     scale = _scale(settings)
@@ -172,7 +173,7 @@ def normalization(folder: Path, default: tuple, device: torch.device) -> tuple[T
         raise ModelError(
             f"{preprocessing_file(folder)}: image_mean",
             expected=f"means within the colors 0 to {scale:g} of its images",
-            found=_excerpt(given["image_mean"]),
+            found=excerpt(given["image_mean"]),
             remedy='fetch the model again, or say "do_rescale": false if the images are not scaled',
         )
     return mean, std
@@ -196,12 +197,6 @@ def _three_numbers(value: Any) -> Tensor | None:
     except OverflowError:  # a whole number of hundreds of digits
         return None
     return numbers if bool(numbers.isfinite().all()) else None
-
-
-def _excerpt(value: Any) -> str:
-    """The begin of a JSON value, for a message."""
-    text = json.dumps(value)
-    return text if len(text) <= 80 else f"{text[:80]}..."
 
 
 def check_images(images: Tensor) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import re
 import warnings
@@ -245,6 +246,12 @@ def read_config(path: Path, what: str) -> dict[str, Any]:
         kinds = {list: "a list", str: "a text", type(None): "null"}
         raise _no_json(path, what, kinds.get(type(content), f"{content}"[:20]))
     return content
+
+
+def excerpt(value: Any) -> str:
+    """The begin of a JSON value, for a message."""
+    text = json.dumps(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."
 
 
 def _no_json(path: Path, what: str, found: str) -> ModelError:
