@@ -303,6 +303,27 @@ def test_an_epsilon_that_norms_cannot_have_is_refused(clip_copy, value):
     refused(clip_copy, f"{path}: text_config.layer_norm_eps: expected a number from 0 to 1, found ")
 
 
+def test_an_unknown_activation_is_refused_by_its_place(clip_copy):
+    path = with_setting(clip_copy, "vision_config.hidden_act", "swish9")
+    expected = f"{path}: vision_config.hidden_act: expected an activation of transformers, such as quick_gelu"
+    refused(clip_copy, expected, 'found "swish9"; fetch config.json again')
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        ("vision_config.num_attention_heads", 7),
+        ("vision_config.image_size", [40, 40]),
+        ("text_config", "none"),
+        ("model_type", "nonsense"),
+        ("model_type", "clap"),
+    ],
+)
+def test_a_configuration_of_which_transformers_builds_nothing_is_named(clip_copy, place, value):
+    with_setting(clip_copy, place, value)
+    refused(clip_copy, f"model {clip_copy}: config.json: expected a model that transformers can load")
+
+
 @pytest.mark.parametrize("name", ["tokenizer.json", "tokenizer_config.json", "special_tokens_map.json"])
 @pytest.mark.parametrize(("content", "found"), [("", "Expecting value"), ("[]", "a list"), ("null", "null")])
 def test_a_damaged_file_of_the_tokenizer_is_refused_by_its_name(clip_copy, name, content, found):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from lexsplat.features.towers import MOST_LAYERS
-from lexsplat.features.weights import excerpt, read_config
+from lexsplat.features.weights import excerpt, read_config, towers_of
 from lexsplat.runtime.errors import ModelError
 
 _SIZES = {
@@ -30,7 +29,7 @@ def check_sizes(folder: Path) -> None:
         ModelError: If one is not a whole number, is below 1, or is absurdly large; or ``config.json`` is damaged.
     """
     path = folder / "config.json"
-    for place, settings in declared(read_config(path, "a model configuration")):
+    for place, settings in towers_of(read_config(path, "a model configuration")):
         for key, value in settings.items():
             expected = _expected(key, value)
             if expected:
@@ -40,19 +39,6 @@ def check_sizes(folder: Path) -> None:
                     found=excerpt(value),
                     remedy="fetch config.json again, or choose another model",
                 )
-
-
-def declared(config: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """The settings of a configuration and of the towers within, each after its place, such as ``vision_config.``."""
-    waiting = [("", config)]
-    while waiting:
-        place, settings = waiting.pop(0)
-        yield place, settings
-        waiting += [
-            (f"{place}{key}.", value)
-            for key, value in settings.items()
-            if key.endswith(("_config", "_config_dict")) and isinstance(value, dict)
-        ]
 
 
 def _expected(key: str, value: Any) -> str:

@@ -7,7 +7,7 @@ import json
 import logging
 import re
 import warnings
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -248,6 +248,19 @@ def read_config(path: Path, what: str) -> dict[str, Any]:
     return content
 
 
+def towers_of(config: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """The settings of a configuration and of the towers within, each after its place, such as ``vision_config.``."""
+    waiting = [("", config)]
+    while waiting:
+        place, settings = waiting.pop(0)
+        yield place, settings
+        waiting += [
+            (f"{place}{key}.", value)
+            for key, value in settings.items()
+            if key.endswith(("_config", "_config_dict")) and isinstance(value, dict)
+        ]
+
+
 def excerpt(value: Any) -> str:
     """The begin of a JSON value, for a message."""
     text = json.dumps(value)
@@ -275,6 +288,7 @@ def build_model(folder: Path, name: str, spare: str) -> Any:
     what = "a model configuration"
     kind_of_model = read_config(folder / "config.json", what).get("model_type")
     state = load_weights(folder, name)
+    damaged = ": config.json"  # what transformers has read when it fails
     try:
         config = AutoConfig.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
         # SAM 2 as it is published; its part for photos is a model of its own.
@@ -285,14 +299,16 @@ def build_model(folder: Path, name: str, spare: str) -> Any:
             config = Sam2Config(**{part: getattr(config, part) for part in parts})
         with torch.device("meta"):
             kind = type(AutoModel.from_config(config))
+        damaged = ""
         model, report = kind.from_pretrained(
             None, config=config, state_dict=state, output_loading_info=True, ignore_mismatched_sizes=True
         )
     except Exception as error:  # KeyError, OSError, ValueError, RuntimeError ...
         if not isinstance(kind_of_model, str):  # transformers may do without, by the name of the folder
             raise _no_json(folder / "config.json", what, "no model_type") from error
+        _check_activations(folder)
         raise ModelError(
-            f"model {name}",
+            f"model {name}{damaged}",
             expected="a model that transformers can load",
             found=f"{str(error)[:160]}",
             remedy="fetch it again, or choose another model",
@@ -313,6 +329,21 @@ def build_model(folder: Path, name: str, spare: str) -> Any:
             folder, name, "a config.json with all layers of the weights", f"no place for {_some(unmatched)}"
         )
     return model.float()  # some models are stored in half precision
+
+
+def _check_activations(folder: Path) -> None:
+    """Refuse an activation that transformers does not know, of which it says the name alone."""
+    from transformers.activations import ACT2FN
+
+    path = folder / "config.json"
+    for place, settings in towers_of(read_config(path, "a model configuration")):
+        value = settings.get("hidden_act")
+        if isinstance(value, str) and value not in ACT2FN:
+            expected = "an activation of transformers, such as quick_gelu or gelu"
+            remedy = "fetch config.json again, or choose another model"
+            raise ModelError(
+                f"{path}: {place}hidden_act", expected=expected, found=excerpt(value), remedy=remedy
+            )
 
 
 def _refuse(folder: Path, name: str, expected: str, found: str) -> None:
