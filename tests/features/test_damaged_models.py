@@ -171,6 +171,48 @@ def test_pickled_weights_that_are_not_tensors_are_refused_in_words_of_lexsplat(
     assert not [one for one in recwarn if "pickle" in str(one.message)]
 
 
+# -- weights that are not there
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors", "tokenizer.json"])
+def test_a_broken_link_or_a_folder_in_place_of_a_file_is_told(clip_copy, name):
+    """As a copy of a part of the Hub's cache leaves them."""
+    path = clip_copy / name
+    path.unlink()
+    path.symlink_to("../../blobs/4d7a")
+    refused(clip_copy, "expected a model folder with ", f"{name}", f", found {name} (a broken link), ")
+    path.unlink()
+    path.mkdir()
+    refused(clip_copy, "expected a model folder with ", f"{name}", f", found {name} (a folder), ")
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        ("{", " that is no JSON (Expecting property name"),
+        ("[]", " without tensors in its weight_map"),
+        ('{"weight_map": {}}', " without tensors in its weight_map"),
+        (
+            '{"weight_map": {"a": "../b/model.safetensors"}}',
+            ' with "../b/model.safetensors" in place of the name',
+        ),
+        ('{"weight_map": {"a": 3}}', " with 3 in place of the name of a file"),
+    ],
+)
+def test_a_damaged_index_of_shards_is_told_with_what_is_wrong(clip_copy, content, found):
+    (clip_copy / "model.safetensors").rename(clip_copy / "model-00001-of-00001.safetensors")
+    (clip_copy / "model.safetensors.index.json").write_text(content)
+    refused(clip_copy, f"all shards of model.safetensors, found model.safetensors.index.json{found}")
+
+
+def test_a_missing_shard_is_told_by_its_name(clip_copy):
+    (clip_copy / "model.safetensors").unlink()
+    table = {"a": "model-00001-of-00002.safetensors", "b": "model-00002-of-00002.safetensors"}
+    (clip_copy / table["a"]).touch()
+    (clip_copy / "model.safetensors.index.json").write_text(json.dumps({"weight_map": table}))
+    refused(clip_copy, f"found no {table['b']}, which model.safetensors.index.json lists")
+
+
 # -- weights that are not plain floats
 
 WEIGHT = "vision_model.encoder.layers.0.mlp.fc1.weight"

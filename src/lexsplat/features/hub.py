@@ -18,7 +18,15 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from lexsplat.features.weights import INDEX, PICKLED_INDEX, WEIGHTS, first_weights, read_config, weight_files
+from lexsplat.features.weights import (
+    INDEX,
+    PICKLED_INDEX,
+    WEIGHTS,
+    fault_of_index,
+    first_weights,
+    read_config,
+    weight_files,
+)
 from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.files import free_bytes, write_file
 from lexsplat.runtime.fingerprints import blocks, digest
@@ -88,10 +96,11 @@ def model_folder(name: str, tower: str) -> Path:
             if "tokenizer" in lacking:
                 _check_has_text(folder, name)
             pickled = lacking == "model.safetensors" and (folder / PICKLED_INDEX).is_file()
+            found = f"{PICKLED_INDEX}, whose shards are pickles" if pickled else _contents(folder)
             raise ModelError(
                 name,
                 expected=f"a model folder with {lacking}",
-                found=f"{PICKLED_INDEX}, whose shards are pickles" if pickled else _contents(folder),
+                found=fault_of_index(folder) if lacking.startswith("all") else found,
                 remedy=_remedy_of_pickles(name) if pickled else _remedy_for(lacking, name, tower),
             )
         for path in loaded_files(folder, tower):
@@ -243,7 +252,9 @@ def _check_has_text(folder: Path, name: str) -> None:
 
 
 def _contents(folder: Path) -> str:
-    names = sorted(path.name for path in folder.iterdir())
+    links = sorted(f"{path.name} (a broken link)" for path in folder.iterdir() if not path.exists())
+    folders = sorted(f"{path.name} (a folder)" for path in folder.iterdir() if path.is_dir())
+    names = [*links, *folders, *sorted(path.name for path in folder.iterdir() if path.is_file())]
     return ", ".join(names[:6]) + (", ..." if len(names) > 6 else "") if names else "an empty folder"
 
 

@@ -82,19 +82,30 @@ def weight_files(folder: Path) -> list[Path]:
     name = first_weights({path.name for path in folder.iterdir() if path.is_file()})
     if name != INDEX:
         return [] if name is None else [folder / name]
-    table = _index(folder / INDEX)
-    # Only files of the folder itself: shard names are not paths.
-    plain = all(isinstance(shard, str) and re.fullmatch(r"[\w.-]{1,200}", shard) for shard in table.values())
-    shards = sorted({folder / shard for shard in table.values()}) if plain else []
-    return shards if all(shard.is_file() for shard in shards) else []
+    return _shards(folder)[0]
 
 
-def _index(path: Path) -> dict[str, Any]:
+def fault_of_index(folder: Path) -> str:
+    """What is wrong with the index of a folder's shards, or with a shard of it; "" if nothing is."""
+    return _shards(folder)[1]
+
+
+def _shards(folder: Path) -> tuple[list[Path], str]:
+    """The shards that the index of a folder lists, or none and why."""
     try:
-        table = read_json(path).get("weight_map")
-    except (FileFormatError, AttributeError):
-        return {}
-    return table if isinstance(table, dict) else {}
+        table = read_json(folder / INDEX).get("weight_map")
+    except FileFormatError as error:
+        return [], f"{INDEX} that is no JSON ({error.found[:80]})"
+    except AttributeError:
+        table = None
+    if not isinstance(table, dict) or not table:
+        return [], f"{INDEX} without tensors in its weight_map"
+    for shard in table.values():  # only files of the folder itself: shard names are not paths
+        if not isinstance(shard, str) or not re.fullmatch(r"[\w.-]{1,200}", shard):
+            return [], f"{INDEX} with {excerpt(shard)} in place of the name of a file in its folder"
+    shards = sorted({folder / shard for shard in table.values()})
+    missing = [shard.name for shard in shards if not shard.is_file()]
+    return ([], f"no {_some(missing)}, which {INDEX} lists") if missing else (shards, "")
 
 
 def load_weights(folder: Path, name: str) -> dict[str, Tensor]:
