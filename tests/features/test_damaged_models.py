@@ -28,6 +28,12 @@ def refused(folder: Path, *parts: str, load=load_clip) -> str:
     return str(caught.value)
 
 
+def change_json(path: Path, change) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
 # -- the image preprocessor
 
 
@@ -73,6 +79,27 @@ def test_an_image_mean_of_another_range_than_the_file_says_is_refused(vit_folder
     refused(
         folder, f"{path}: image_mean", "means within the colors 0 to 1", "122.8", "do_rescale", load=load_dino
     )
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("image_mean", [-100] * 3, "means within the colors 0 to 1 of its images, found [-100, -100, -100];"),
+        ("image_std", [1e-30] * 3, "deviations within the colors 0.0001 to 1 of its images, found [1e-30, "),
+        (
+            "image_std",
+            [68.5, 66.6, 70.3],
+            "deviations within the colors 0.0001 to 1 of its images, found [68.5",
+        ),
+    ],
+)
+def test_means_and_deviations_that_colors_cannot_have_are_refused(
+    clip_copy, vit_folder, tmp_path, key, value, expected
+):
+    for folder, load in ((clip_copy, load_clip), (shutil.copytree(vit_folder, tmp_path / "vit"), load_dino)):
+        path = folder / "preprocessor_config.json"
+        change_json(path, lambda content: content.update({key: value}))
+        refused(folder, f"{path}: {key}: expected {expected}", "fetch the model again", load=load)
 
 
 @pytest.mark.parametrize(
@@ -282,12 +309,6 @@ def test_a_damaged_configuration_is_refused_by_its_name(clip_copy, vit_folder, t
         refused(folder, expected, "fetch the model again", load=load)
 
 
-def change_json(path: Path, change) -> None:
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-
-
 def with_setting(folder: Path, place: str, value) -> Path:
     """The ``config.json`` of a folder with a setting such as "vision_config.patch_size"; None takes it away."""
     path, (*parts, key) = folder / "config.json", place.split(".")
@@ -413,6 +434,29 @@ def test_a_start_of_prompts_without_a_row_in_the_model_is_not_taken_as_it_is(cli
 
 
 # -- the text tower
+
+
+@pytest.mark.parametrize(
+    ("end", "found"),
+    [
+        ([1637], "[1637]"),
+        (10**9, "1000000000"),
+        (-1, "-1"),
+        (None, "49407, as it is where the file gives none"),
+    ],
+)
+def test_an_end_token_that_the_model_does_not_have_is_an_error_of_its_configuration(clip_copy, end, found):
+    path = with_setting(clip_copy, "text_config.eos_token_id", end)
+    expected = (
+        f"{path}: text_config.eos_token_id: expected the number of the token that ends prompts (1637 by"
+    )
+    for load in (load_clip, load_text):
+        refused(clip_copy, expected, f", found {found}; fetch config.json again", load=load)
+
+
+def test_another_end_token_of_the_model_is_told_with_the_file_that_names_it(clip_copy):
+    with_setting(clip_copy, "text_config.eos_token_id", 5)
+    refused(clip_copy, "ends prompts with the model's end token (5 in config.json), found token 1637")
 
 
 def test_a_word_whose_numbers_are_not_finite_is_refused_though_no_check_reads_it(clip_copy):
