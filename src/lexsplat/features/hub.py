@@ -53,6 +53,7 @@ _VOCABULARIES = (
 _TOKENIZER_SETTINGS = ("tokenizer_config.json", "special_tokens_map.json", "added_tokens.json")
 _OTHERS = {"segments": "superpixels, which need no model (`--features.segments slic`)"}
 """Alternative for a role without a bundled model."""
+_NEARLY = 0.95  # likeness of names from which on one is the other misspelt
 _HUB_TIMEOUT = 5.0  # seconds to wait for the hub's first response; without a network it fails at once
 
 KEPT_FROM = 1 << 26
@@ -381,6 +382,13 @@ def _choices(tower: str) -> str:
     return f"give another model, a folder (`{_option(tower)} FOLDER`), or {other}"
 
 
+def _near(name: str, tower: str) -> str:
+    """The start of a remedy for a name that is nearly that of a default model; "" for others."""
+    known = {pinned.lower(): pinned for pinned in PINNED}
+    found = get_close_matches(name.lower(), known, n=1, cutoff=_NEARLY) if name not in PINNED else []
+    return f"use `--{tower} {known[found[0]]}` if you mean that; or " if found else ""
+
+
 def _option(tower: str) -> str:
     return f"--features.{tower}" if tower in _OTHERS else f"--{tower}"
 
@@ -418,6 +426,7 @@ def _refusal(name: str, tower: str, error: Exception, cache: Path, lacking: str)
         )
     if isinstance(error, hub.RepositoryNotFoundError):
         remedy = f"check the spelling (a private model needs `hf auth login`); or {_choices(tower)}"
+        remedy = _near(name, tower) + remedy
         return refuse(
             "a folder or the name of a model on the hub", "no such folder and no such model", remedy
         )
@@ -435,5 +444,6 @@ def _refusal(name: str, tower: str, error: Exception, cache: Path, lacking: str)
         found = f"a copy in {cache} without {lacking}; {found.removeprefix('no local copy, and ')}"
     elif name not in PINNED:  # OWNER/NAME may as well be a path
         found = f"no such folder, {'' if found.startswith('no ') else 'and '}{found}"
-        expected, remedy = f"a model folder or {expected}", f"check the path, or {remedy}"
+        expected = f"a model folder or {expected}"
+        remedy = f"{_near(name, tower)}check the path, or {remedy}"
     return refuse(expected, found, remedy)
