@@ -50,7 +50,7 @@ _PREPROCESSING = ("preprocessor_config.json", "processor_config.json")
 _VOCABULARIES = (
     "tokenizer.json", "vocab.json", "vocab.txt", "spiece.model", "tokenizer.model", "sentencepiece.bpe.model",
 )  # fmt: skip
-_TOKENIZER_SETTINGS = ("tokenizer_config.json", "special_tokens_map.json", "added_tokens.json")
+TOKENIZER_SETTINGS = ("tokenizer_config.json", "special_tokens_map.json", "added_tokens.json")
 _OTHERS = {"segments": "superpixels, which need no model (`--features.segments slic`)"}
 """Alternative for a role without a bundled model."""
 _NEARLY = 0.95  # likeness of names from which on one is the other misspelt
@@ -151,7 +151,7 @@ def _vocabulary(folder: Path) -> list[Path]:
 
 def tokenizer_files(folder: Path) -> list[Path]:
     """The files of a tokenizer: its vocabulary, then its settings."""
-    settings = [path for name in _TOKENIZER_SETTINGS if (path := folder / name).is_file()]
+    settings = [path for name in TOKENIZER_SETTINGS if (path := folder / name).is_file()]
     return [*_vocabulary(folder), *settings]
 
 
@@ -187,15 +187,11 @@ def content_hash(folder: Path, tower: str) -> str:
     The process keeps the hash under the place, size and time of change of the files. The user's cache keeps hashes of
     large models under the same facts.
     """
-    return _hash_of(loaded_files(folder, tower))
+    return hash_of(loaded_files(folder, tower))
 
 
-def hash_without_settings(folder: Path) -> str:
-    """The `content_hash` of a CLIP without the settings beside its tokenizer's vocabulary, which may come later."""
-    return _hash_of([path for path in loaded_files(folder, "clip") if path.name not in _TOKENIZER_SETTINGS])
-
-
-def _hash_of(files: list[Path]) -> str:
+def hash_of(files: list[Path]) -> str:
+    """`content_hash` of these files, sorted."""
     state = _state(files)
     if state in _hashes:
         return _hashes[state]
@@ -345,7 +341,7 @@ def _wanted(names: Collection[str], tower: str) -> list[str]:
     shards = [name for name in names if name.startswith("model-") and name.endswith(".safetensors")]
     wanted = {"config.json", *_PREPROCESSING, weights, *(shards if weights == INDEX else [])}
     if tower == "clip":
-        wanted |= {*_VOCABULARIES, "merges.txt", *_TOKENIZER_SETTINGS}
+        wanted |= {*_VOCABULARIES, "merges.txt", *TOKENIZER_SETTINGS}
     return sorted(name for name in names if name in wanted)
 
 
