@@ -28,6 +28,12 @@ def refused(folder: Path, *parts: str, load=load_clip) -> str:
     return str(caught.value)
 
 
+def change_json(path: Path, change) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
 # -- the image preprocessor
 
 
@@ -73,6 +79,27 @@ def test_an_image_mean_of_another_range_than_the_file_says_is_refused(vit_folder
     refused(
         folder, f"{path}: image_mean", "means within the colors 0 to 1", "122.8", "do_rescale", load=load_dino
     )
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("image_mean", [-100] * 3, "means within the colors 0 to 1 of its images, found [-100, -100, -100];"),
+        ("image_std", [1e-30] * 3, "deviations within the colors 0.0001 to 1 of its images, found [1e-30, "),
+        (
+            "image_std",
+            [68.5, 66.6, 70.3],
+            "deviations within the colors 0.0001 to 1 of its images, found [68.5",
+        ),
+    ],
+)
+def test_means_and_deviations_that_colors_cannot_have_are_refused(
+    clip_copy, vit_folder, tmp_path, key, value, expected
+):
+    for folder, load in ((clip_copy, load_clip), (shutil.copytree(vit_folder, tmp_path / "vit"), load_dino)):
+        path = folder / "preprocessor_config.json"
+        change_json(path, lambda content: content.update({key: value}))
+        refused(folder, f"{path}: {key}: expected {expected}", "fetch the model again", load=load)
 
 
 @pytest.mark.parametrize(
@@ -171,6 +198,95 @@ def test_pickled_weights_that_are_not_tensors_are_refused_in_words_of_lexsplat(
     assert not [one for one in recwarn if "pickle" in str(one.message)]
 
 
+# -- weights that are not there
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors", "tokenizer.json"])
+def test_a_broken_link_or_a_folder_in_place_of_a_file_is_told(clip_copy, name):
+    """As a copy of a part of the Hub's cache leaves them."""
+    path = clip_copy / name
+    path.unlink()
+    path.symlink_to("../../blobs/4d7a")
+    refused(clip_copy, "expected a model folder with ", f"{name}", f", found {name} (a broken link), ")
+    path.unlink()
+    path.mkdir()
+    refused(clip_copy, "expected a model folder with ", f"{name}", f", found {name} (a folder), ")
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        ("{", " that is no JSON (Expecting property name"),
+        ("[]", " without tensors in its weight_map"),
+        ('{"weight_map": {}}', " without tensors in its weight_map"),
+        (
+            '{"weight_map": {"a": "../b/model.safetensors"}}',
+            ' with "../b/model.safetensors" in place of the name',
+        ),
+        ('{"weight_map": {"a": 3}}', " with 3 in place of the name of a file"),
+    ],
+)
+def test_a_damaged_index_of_shards_is_told_with_what_is_wrong(clip_copy, content, found):
+    (clip_copy / "model.safetensors").rename(clip_copy / "model-00001-of-00001.safetensors")
+    (clip_copy / "model.safetensors.index.json").write_text(content)
+    refused(clip_copy, f"all shards of model.safetensors, found model.safetensors.index.json{found}")
+
+
+def test_a_missing_shard_is_told_by_its_name(clip_copy):
+    (clip_copy / "model.safetensors").unlink()
+    table = {"a": "model-00001-of-00002.safetensors", "b": "model-00002-of-00002.safetensors"}
+    (clip_copy / table["a"]).touch()
+    (clip_copy / "model.safetensors.index.json").write_text(json.dumps({"weight_map": table}))
+    refused(clip_copy, f"found no {table['b']}, which model.safetensors.index.json lists")
+
+
+# -- weights that are not plain floats
+
+WEIGHT = "vision_model.encoder.layers.0.mlp.fc1.weight"
+
+
+def rewritten(folder: Path, change) -> Path:
+    """The folder with ``change`` of its tensors."""
+    path = folder / "model.safetensors"
+    save_file(change(load_file(path)), path, {"format": "pt"})
+    return folder
+
+
+@pytest.mark.parametrize(
+    "dtype",
+    [torch.int8, torch.uint8, torch.int32, torch.bool, torch.float8_e4m3fn, torch.complex64],
+    ids=lambda dtype: str(dtype).removeprefix("torch."),
+)
+def test_quantized_weights_are_refused_with_their_type_and_name(clip_copy, vit_folder, tmp_path, dtype):
+    """Their scales are not read, so that they would be other weights."""
+    found = f"model.safetensors: expected weights in float16, bfloat16, float32 or float64, found {dtype}"
+    found, remedy = found.replace("torch.", ""), "; fetch the float version of the model"
+    rewritten(clip_copy, lambda state: state | {WEIGHT: (state[WEIGHT] * 99).to(dtype)})
+    for load in (load_clip, load_text):
+        refused(clip_copy, f"{found} in {WEIGHT}{remedy}", load=load)
+    vit = shutil.copytree(vit_folder, tmp_path / "vit")
+    rewritten(vit, lambda state: {key: value.to(dtype) for key, value in state.items()})
+    refused(vit, f"{found} in ", remedy, load=load_dino)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_weights_in_other_floats_and_places_in_whole_numbers_load(clip_copy, clip_folder, dtype):
+    places = {
+        f"{tower}_model.embeddings.position_ids": torch.arange(26)[None] for tower in ("text", "vision")
+    }
+    rewritten(clip_copy, lambda state: {key: value.to(dtype) for key, value in state.items()} | places)
+    found, expected = (load_clip(str(each)).encode_text(["a car"]) for each in (clip_copy, clip_folder))
+    assert float((found * expected).sum()) > 0.99
+
+
+def test_sparse_weights_are_refused_by_the_name_of_a_tensor(clip_copy):
+    state = load_file(clip_copy / "model.safetensors")
+    pickled(clip_copy, state | {WEIGHT: state[WEIGHT].to_sparse()})
+    found = f"or float64, found sparse_coo in {WEIGHT};"
+    for load in (load_clip, load_text):
+        refused(clip_copy, "pytorch_model.bin: expected weights", found, "dense", load=load)
+
+
 # -- configuration and tokenizer
 
 
@@ -193,6 +309,84 @@ def test_a_damaged_configuration_is_refused_by_its_name(clip_copy, vit_folder, t
         refused(folder, expected, "fetch the model again", load=load)
 
 
+def with_setting(folder: Path, place: str, value) -> Path:
+    """The ``config.json`` of a folder with a setting such as "vision_config.patch_size"; None takes it away."""
+    path, (*parts, key) = folder / "config.json", place.split(".")
+
+    def changed(content: dict) -> None:
+        for part in parts:
+            content = content[part]
+        content[key] = value
+        if value is None:
+            del content[key]
+
+    change_json(path, changed)
+    return path
+
+
+@pytest.mark.parametrize("value", [0, -4, "4", 2.5, True, [], [40, 0], HUGE, 1_000_000_000])
+def test_a_size_that_is_not_a_number_from_1_is_refused_by_its_place(clip_copy, value):
+    path = with_setting(clip_copy, "vision_config.num_attention_heads", value)
+    expected = (
+        f"{path}: vision_config.num_attention_heads: expected a whole number from 1 to 1,048,576, found "
+    )
+    refused(clip_copy, f"{expected}{json.dumps(value)}"[:200], "; fetch config.json again")
+
+
+@pytest.mark.parametrize("value", [0, -1, 1_000_000])
+@pytest.mark.parametrize("place", ["text_config.num_hidden_layers", "vision_config.num_hidden_layers"])
+def test_no_layers_and_a_million_layers_are_refused_before_they_are_built(clip_copy, place, value):
+    path = with_setting(clip_copy, place, value)
+    refused(clip_copy, f"{path}: {place}: expected a whole number from 1 to 256, found {value};")
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "text_config.hidden_size", "text_config.vocab_size", "text_config.max_position_embeddings",
+        "text_config.intermediate_size", "text_config.num_attention_heads", "vision_config.hidden_size",
+        "vision_config.patch_size", "vision_config.image_size", "vision_config.num_channels", "projection_dim",
+    ],
+)  # fmt: skip
+def test_sizes_of_every_kind_are_refused_at_0_and_below(clip_copy, place):
+    for value in (0, -8):
+        path = with_setting(clip_copy, place, value)
+        refused(clip_copy, f"{path}: {place}: expected a whole number from 1 to", f", found {value};")
+
+
+@pytest.mark.parametrize("key", ["patch_size", "image_size", "num_hidden_layers", "num_attention_heads"])
+def test_sizes_of_a_vision_transformer_are_refused_at_0(vit_folder, tmp_path, key):
+    path = with_setting(shutil.copytree(vit_folder, tmp_path / "vit"), key, 0)
+    refused(path.parent, f"{path}: {key}: expected a whole number from 1", "found 0;", load=load_dino)
+
+
+@pytest.mark.parametrize("value", [-1.0, float("nan"), 1e9, "1e-5", HUGE])
+def test_an_epsilon_that_norms_cannot_have_is_refused(clip_copy, value):
+    path = with_setting(clip_copy, "text_config.layer_norm_eps", value)
+    refused(clip_copy, f"{path}: text_config.layer_norm_eps: expected a number from 0 to 1, found ")
+
+
+def test_an_unknown_activation_is_refused_by_its_place(clip_copy):
+    path = with_setting(clip_copy, "vision_config.hidden_act", "swish9")
+    expected = f"{path}: vision_config.hidden_act: expected an activation of transformers, such as quick_gelu"
+    refused(clip_copy, expected, 'found "swish9"; fetch config.json again')
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        ("vision_config.num_attention_heads", 7),
+        ("vision_config.image_size", [40, 40]),
+        ("text_config", "none"),
+        ("model_type", "nonsense"),
+        ("model_type", "clap"),
+    ],
+)
+def test_a_configuration_of_which_transformers_builds_nothing_is_named(clip_copy, place, value):
+    with_setting(clip_copy, place, value)
+    refused(clip_copy, f"model {clip_copy}: config.json: expected a model that transformers can load")
+
+
 @pytest.mark.parametrize("name", ["tokenizer.json", "tokenizer_config.json", "special_tokens_map.json"])
 @pytest.mark.parametrize(("content", "found"), [("", "Expecting value"), ("[]", "a list"), ("null", "null")])
 def test_a_damaged_file_of_the_tokenizer_is_refused_by_its_name(clip_copy, name, content, found):
@@ -208,7 +402,61 @@ def test_json_that_is_no_tokenizer_is_refused_by_its_name(clip_copy, content):
     assert "added_tokens'" not in message
 
 
+@pytest.mark.parametrize(
+    ("number", "found"),
+    [
+        (99_999, "token 'banknote</w>' with the number 99999"),
+        (1638, "token 'banknote</w>' with the number 1638"),
+        (7, "the number 7 for both "),
+        (-1, "-1"),
+    ],
+)
+def test_a_token_without_a_row_of_its_own_in_the_model_is_refused_by_every_loader(clip_copy, number, found):
+    """The model would be built with, and the first question with that word would fail."""
+    path = clip_copy / "tokenizer.json"
+
+    def moved(content: dict) -> None:
+        content["model"]["vocab"]["banknote</w>"] = number
+
+    change_json(path, moved)
+    for load in (load_clip, load_text):
+        refused(clip_copy, f"{path}: expected ", found, "; fetch the model again", load=load)
+
+
+def test_a_start_of_prompts_without_a_row_in_the_model_is_not_taken_as_it_is(clip_copy, clip_folder):
+    change_json(
+        clip_copy / "tokenizer.json",
+        lambda content: content["post_processor"].update(cls=["<|startoftext|>", 99_999]),
+    )
+    for load in (load_clip, load_text):  # transformers adds the start itself
+        found, expected = (load(str(each)).encode_text(["a car"]) for each in (clip_copy, clip_folder))
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
 # -- the text tower
+
+
+@pytest.mark.parametrize(
+    ("end", "found"),
+    [
+        ([1637], "[1637]"),
+        (10**9, "1000000000"),
+        (-1, "-1"),
+        (None, "49407, as it is where the file gives none"),
+    ],
+)
+def test_an_end_token_that_the_model_does_not_have_is_an_error_of_its_configuration(clip_copy, end, found):
+    path = with_setting(clip_copy, "text_config.eos_token_id", end)
+    expected = (
+        f"{path}: text_config.eos_token_id: expected the number of the token that ends prompts (1637 by"
+    )
+    for load in (load_clip, load_text):
+        refused(clip_copy, expected, f", found {found}; fetch config.json again", load=load)
+
+
+def test_another_end_token_of_the_model_is_told_with_the_file_that_names_it(clip_copy):
+    with_setting(clip_copy, "text_config.eos_token_id", 5)
+    refused(clip_copy, "ends prompts with the model's end token (5 in config.json), found token 1637")
 
 
 def test_a_word_whose_numbers_are_not_finite_is_refused_though_no_check_reads_it(clip_copy):

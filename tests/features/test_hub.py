@@ -194,6 +194,20 @@ def test_a_name_that_may_be_a_missing_folder_is_reported_as_both(fake):
     assert "folder," not in str(caught.value).split(";")[0], "a default is no path"
 
 
+@pytest.mark.parametrize("name", [DEFAULT_CLIP.lower(), DEFAULT_CLIP.upper(), f"{DEFAULT_CLIP[:-1]}O"])
+def test_a_name_that_is_nearly_the_default_ones_is_told_how_that_is_spelt(fake, name):
+    for error in (
+        errors.OfflineModeIsEnabled("offline"),
+        ConnectionError("no route"),
+        hub_error(errors.RepositoryNotFoundError, 404),
+    ):
+        fake.error = error
+        refused(f"; use `--clip {DEFAULT_CLIP}` if you mean that; or check the ", name=name)
+    with pytest.raises(ModelError) as caught:
+        load_clip("laion/CLIP-ViT-L-14-laion2B-s32B-b82K")
+    assert DEFAULT_CLIP not in str(caught.value), "another model"
+
+
 def test_each_cause_has_its_own_message(fake):
     fake.error = hub_error(errors.RepositoryNotFoundError, 404)
     refused("no such folder and no such model", "check the spelling")

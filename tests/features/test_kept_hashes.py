@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import time
@@ -10,7 +11,8 @@ import pytest
 
 from lexsplat.features import hub
 from lexsplat.features.hub import content_hash
-from lexsplat.features.text import check_encoder
+from lexsplat.features.same_encoder import check_encoder, under_hash_of_features
+from lexsplat.features.text import TextCache, load_text
 from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.user_cache import user_cache
 
@@ -137,3 +139,22 @@ def test_settings_of_a_tokenizer_that_come_after_the_features_make_no_other_enco
         file.write(" ")
     with pytest.raises(ModelError, match="another one"):
         check_encoder(str(folder), content_hash(folder, "clip"), built_with)
+
+
+@pytest.mark.slow
+def test_a_second_file_of_settings_makes_no_other_encoder_and_new_words_are_answered(clip_folder, tmp_path):
+    folder = shutil.copytree(clip_folder, tmp_path / "clip")
+    assert (folder / "tokenizer_config.json").is_file(), "the first one"
+    built_with = content_hash(folder, "clip")
+    for name in ("special_tokens_map.json", "added_tokens.json"):
+        (folder / name).write_text("{}")
+        check_encoder(str(folder), content_hash(folder, "clip"), built_with)
+    tower = load_text(str(folder))
+    answering = under_hash_of_features(str(folder), tower, built_with)
+    found = TextCache(tmp_path / "texts").encode(built_with, ["a word"], lambda: answering)
+    assert found.tolist() == tower.encode_text(["a word"]).tolist()
+    assert tower.content_hash != built_with, "the tower itself may serve another scene"
+    settings = json.loads((folder / "tokenizer_config.json").read_text())
+    (folder / "tokenizer_config.json").write_text(json.dumps(settings | {"unk_token": "a"}))
+    with pytest.raises(ModelError, match="another one"):
+        under_hash_of_features(str(folder), load_text(str(folder)), built_with)

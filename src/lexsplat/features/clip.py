@@ -21,13 +21,14 @@ from lexsplat.features.clip_text import (
     ClipText,
     is_vocabulary,
     light_tower,
+    misnumbered,
     warn_truncated,
 )
 from lexsplat.features.hub import local_folder, tokenizer_files
 from lexsplat.features.portable import TextWeights, tokenizer_content
 from lexsplat.features.pretrained import PretrainedModel, check_images, normalization, resize_images
 from lexsplat.features.towers import clip_images
-from lexsplat.features.weights import load_weights, read_config
+from lexsplat.features.weights import excerpt, load_weights, read_config
 from lexsplat.runtime.errors import ModelError
 
 DEFAULT_CLIP = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
@@ -68,7 +69,7 @@ class ClipEncoder(PretrainedModel):
         if self._texts is None:
             self._text_length = int(config.text_config.max_position_embeddings)
             self._tokenizer = _load_tokenizer(folder, name, config)
-            self._check_text(config)
+            self._check_text(config, folder)
         words = self.encode_text(UNLIKE_WORDS)
         self.dim = int(words.shape[-1])
         if F.pdist(words).min() < UNLIKE:
@@ -78,7 +79,7 @@ class ClipEncoder(PretrainedModel):
                 f"the same embedding for {', '.join(UNLIKE_WORDS[:3])} ...",
             )
 
-    def _check_text(self, config: Any) -> None:
+    def _check_text(self, config: Any, folder: Path) -> None:
         """Refuse a text tower with numbers that are not finite, and prompts without the end where CLIP reads them."""
         named = self._model.named_parameters()
         if not all(bool(value.isfinite().all()) for key, value in named if key.startswith("text_")):
@@ -86,9 +87,17 @@ class ClipEncoder(PretrainedModel):
         if config.model_type != "clip":
             return
         ids, end = self._tokenizer(UNLIKE_WORDS[0])["input_ids"], config.text_config.eos_token_id
-        if ids[-1] != (max(ids) if end == LEGACY_END else end):
-            wanted = f"a tokenizer that ends prompts with the model's end token ({end})"
+        if ids[-1] == (max(ids) if end == LEGACY_END else end):
+            return
+        if type(end) is int and 0 <= end < config.text_config.vocab_size:
+            wanted = f"a tokenizer that ends prompts with the model's end token ({end} in config.json)"
             raise self._refusal(wanted, "fetch the model again with its tokenizer files", f"token {ids[-1]}")
+        raise ModelError(
+            f"{folder / 'config.json'}: text_config.eos_token_id",
+            expected=f"the number of the token that ends prompts ({ids[-1]} by the tokenizer)",
+            found=excerpt(end) + ("" if _declares_end(folder) else ", as it is where the file gives none"),
+            remedy="fetch config.json again",
+        )
 
     def _own_model(self, folder: Path) -> Any:
         self._texts = None
@@ -246,6 +255,11 @@ class ClipEncoder(PretrainedModel):
         }
 
 
+def _declares_end(folder: Path) -> bool:
+    config = read_config(folder / "config.json", "a model configuration")
+    return "eos_token_id" in (config.get("text_config") or config.get("text_config_dict") or {})
+
+
 def _load_tokenizer(folder: Path, name: str, config: Any) -> Any:
     """The tokenizer of a model."""
     from transformers import AutoTokenizer
@@ -268,6 +282,14 @@ def _load_tokenizer(folder: Path, name: str, config: Any) -> Any:
             expected=f"a tokenizer with the {size:,} words of the model",
             found=f"{len(tokenizer):,} words",
             remedy=f"fetch the model again with its tokenizer files; they are read from {folder}",
+        )
+    fault = misnumbered(tokenizer.get_vocab(), tokenizer(UNLIKE_WORDS[0])["input_ids"], size)
+    if fault:
+        raise ModelError(
+            tokenizer_files(folder)[0],
+            expected=f"another number below {size} for each token (vocab_size in config.json)",
+            found=fault,
+            remedy="fetch the model again with its tokenizer files",
         )
     return tokenizer
 

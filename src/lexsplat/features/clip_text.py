@@ -101,12 +101,32 @@ def _tokenizer(path: Path, size: int) -> Any:
         return None
     tokenizer.no_truncation()
     tokenizer.no_padding()
-    return tokenizer if is_vocabulary(tokenizer.get_vocab_size(), size) else None
+    known = is_vocabulary(tokenizer.get_vocab_size(), size)
+    ids = tokenizer.encode(UNLIKE_WORDS[0]).ids
+    return tokenizer if known and not misnumbered(tokenizer.get_vocab(), ids, size) else None
 
 
 def is_vocabulary(words: int, size: int) -> bool:
     """Whether a tokenizer of so many words belongs to a model of ``size``, padded to a multiple of at most 128."""
     return size - 128 < words <= size
+
+
+def misnumbered(vocabulary: Mapping[str, int], ids: Sequence[int], size: int) -> str:
+    """The first number of a token for which a model has no row, or which two tokens share; "" if there is none.
+
+    Args:
+        vocabulary: The number of each token.
+        ids: Numbers in a prompt, some of which a tokenizer adds by other rules.
+        size: Rows of the model's token embedding.
+    """
+    owners: dict[int, str] = {}
+    for token, number in vocabulary.items():
+        if not 0 <= number < size:
+            return f"token {token[:30]!r} with the number {number}"
+        if owners.setdefault(number, token) != token:
+            return f"the number {number} for both {owners[number][:30]!r} and {token[:30]!r}"
+    outside = [number for number in ids if not 0 <= number < size]
+    return f"the number {outside[0]} in a prompt" if outside else ""
 
 
 def warn_truncated(prompt: str, tokens: int, limit: int) -> None:

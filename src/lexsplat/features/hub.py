@@ -18,7 +18,15 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from lexsplat.features.weights import INDEX, PICKLED_INDEX, WEIGHTS, first_weights, read_config, weight_files
+from lexsplat.features.weights import (
+    INDEX,
+    PICKLED_INDEX,
+    WEIGHTS,
+    fault_of_index,
+    first_weights,
+    read_config,
+    weight_files,
+)
 from lexsplat.runtime.errors import ModelError
 from lexsplat.runtime.files import free_bytes, write_file
 from lexsplat.runtime.fingerprints import blocks, digest
@@ -42,9 +50,10 @@ _PREPROCESSING = ("preprocessor_config.json", "processor_config.json")
 _VOCABULARIES = (
     "tokenizer.json", "vocab.json", "vocab.txt", "spiece.model", "tokenizer.model", "sentencepiece.bpe.model",
 )  # fmt: skip
-_TOKENIZER_SETTINGS = ("tokenizer_config.json", "special_tokens_map.json", "added_tokens.json")
+TOKENIZER_SETTINGS = ("tokenizer_config.json", "special_tokens_map.json", "added_tokens.json")
 _OTHERS = {"segments": "superpixels, which need no model (`--features.segments slic`)"}
 """Alternative for a role without a bundled model."""
+_NEARLY = 0.95  # likeness of names from which on one is the other misspelt
 _HUB_TIMEOUT = 5.0  # seconds to wait for the hub's first response; without a network it fails at once
 
 KEPT_FROM = 1 << 26
@@ -88,10 +97,11 @@ def model_folder(name: str, tower: str) -> Path:
             if "tokenizer" in lacking:
                 _check_has_text(folder, name)
             pickled = lacking == "model.safetensors" and (folder / PICKLED_INDEX).is_file()
+            found = f"{PICKLED_INDEX}, whose shards are pickles" if pickled else _contents(folder)
             raise ModelError(
                 name,
                 expected=f"a model folder with {lacking}",
-                found=f"{PICKLED_INDEX}, whose shards are pickles" if pickled else _contents(folder),
+                found=fault_of_index(folder) if lacking.startswith("all") else found,
                 remedy=_remedy_of_pickles(name) if pickled else _remedy_for(lacking, name, tower),
             )
         for path in loaded_files(folder, tower):
@@ -141,7 +151,7 @@ def _vocabulary(folder: Path) -> list[Path]:
 
 def tokenizer_files(folder: Path) -> list[Path]:
     """The files of a tokenizer: its vocabulary, then its settings."""
-    settings = [path for name in _TOKENIZER_SETTINGS if (path := folder / name).is_file()]
+    settings = [path for name in TOKENIZER_SETTINGS if (path := folder / name).is_file()]
     return [*_vocabulary(folder), *settings]
 
 
@@ -177,15 +187,11 @@ def content_hash(folder: Path, tower: str) -> str:
     The process keeps the hash under the place, size and time of change of the files. The user's cache keeps hashes of
     large models under the same facts.
     """
-    return _hash_of(loaded_files(folder, tower))
+    return hash_of(loaded_files(folder, tower))
 
 
-def hash_without_settings(folder: Path) -> str:
-    """The `content_hash` of a CLIP without the settings beside its tokenizer's vocabulary, which may come later."""
-    return _hash_of([path for path in loaded_files(folder, "clip") if path.name not in _TOKENIZER_SETTINGS])
-
-
-def _hash_of(files: list[Path]) -> str:
+def hash_of(files: list[Path]) -> str:
+    """`content_hash` of these files, sorted."""
     state = _state(files)
     if state in _hashes:
         return _hashes[state]
@@ -243,7 +249,9 @@ def _check_has_text(folder: Path, name: str) -> None:
 
 
 def _contents(folder: Path) -> str:
-    names = sorted(path.name for path in folder.iterdir())
+    links = sorted(f"{path.name} (a broken link)" for path in folder.iterdir() if not path.exists())
+    folders = sorted(f"{path.name} (a folder)" for path in folder.iterdir() if path.is_dir())
+    names = [*links, *folders, *sorted(path.name for path in folder.iterdir() if path.is_file())]
     return ", ".join(names[:6]) + (", ..." if len(names) > 6 else "") if names else "an empty folder"
 
 
@@ -333,7 +341,7 @@ def _wanted(names: Collection[str], tower: str) -> list[str]:
     shards = [name for name in names if name.startswith("model-") and name.endswith(".safetensors")]
     wanted = {"config.json", *_PREPROCESSING, weights, *(shards if weights == INDEX else [])}
     if tower == "clip":
-        wanted |= {*_VOCABULARIES, "merges.txt", *_TOKENIZER_SETTINGS}
+        wanted |= {*_VOCABULARIES, "merges.txt", *TOKENIZER_SETTINGS}
     return sorted(name for name in names if name in wanted)
 
 
@@ -368,6 +376,13 @@ def _choices(tower: str) -> str:
     other = _OTHERS.get(tower, f"the small bundled encoder (`--{tower} bundled`)")
     other += "; or go without (`--dino none`)" if tower == "dino" else ""
     return f"give another model, a folder (`{_option(tower)} FOLDER`), or {other}"
+
+
+def _near(name: str, tower: str) -> str:
+    """The start of a remedy for a name that is nearly that of a default model; "" for others."""
+    known = {pinned.lower(): pinned for pinned in PINNED}
+    found = get_close_matches(name.lower(), known, n=1, cutoff=_NEARLY) if name not in PINNED else []
+    return f"use `--{tower} {known[found[0]]}` if you mean that; or " if found else ""
 
 
 def _option(tower: str) -> str:
@@ -407,6 +422,7 @@ def _refusal(name: str, tower: str, error: Exception, cache: Path, lacking: str)
         )
     if isinstance(error, hub.RepositoryNotFoundError):
         remedy = f"check the spelling (a private model needs `hf auth login`); or {_choices(tower)}"
+        remedy = _near(name, tower) + remedy
         return refuse(
             "a folder or the name of a model on the hub", "no such folder and no such model", remedy
         )
@@ -424,5 +440,6 @@ def _refusal(name: str, tower: str, error: Exception, cache: Path, lacking: str)
         found = f"a copy in {cache} without {lacking}; {found.removeprefix('no local copy, and ')}"
     elif name not in PINNED:  # OWNER/NAME may as well be a path
         found = f"no such folder, {'' if found.startswith('no ') else 'and '}{found}"
-        expected, remedy = f"a model folder or {expected}", f"check the path, or {remedy}"
+        expected = f"a model folder or {expected}"
+        remedy = f"{_near(name, tower)}check the path, or {remedy}"
     return refuse(expected, found, remedy)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import logging
 import math
 import time
@@ -20,8 +19,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lexsplat.features.declared_sizes import check_sizes
 from lexsplat.features.hub import content_hash, preprocessing, preprocessing_file
-from lexsplat.features.weights import build_model
+from lexsplat.features.weights import build_model, excerpt
 from lexsplat.runtime.device import one_thread
 from lexsplat.runtime.errors import ModelError
 
@@ -32,6 +32,8 @@ IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 _CLEARLY = 0.8
 """Share of the time in float32 below which bfloat16 is chosen, so that noise does not decide."""
+_STD = 1e-4, 1.01
+"""Deviations of colors in 0..1, from a fortieth of a step of 8 bits to none by rounded numbers."""
 
 
 class PretrainedModel:
@@ -43,7 +45,7 @@ class PretrainedModel:
         device: Device of the model.
 
     Raises:
-        ModelError: If neither can load the folder, or a weight is missing.
+        ModelError: If neither can load the folder, a weight is missing, or ``config.json`` has sizes of no model.
     """
 
     tower: ClassVar[str]
@@ -53,6 +55,7 @@ class PretrainedModel:
 
     def __init__(self, folder: Path, name: str, device: torch.device | str = "cpu") -> None:
         self.name, self.device = name, torch.device(device)
+        check_sizes(folder)
         self.content_hash = content_hash(folder, self.tower)
         model = self._own_model(folder)
         if model is None:
@@ -145,8 +148,8 @@ def normalization(folder: Path, default: tuple, device: torch.device) -> tuple[T
     They are those of images in 0..1, whatever the file scales colors by.
 
     Raises:
-        ModelError: If one of the two is not three finite numbers, a deviation is not positive, or they are of images
-            in another range than the file says.
+        ModelError: If one of the two is not three finite numbers, a deviation is not positive, or they are not of
+            images in the range that the file says.
     """
     settings, keys = preprocessing(folder), ("image_mean", "image_std")
     if not all(key in settings for key in keys):
@@ -161,19 +164,24 @@ def normalization(folder: Path, default: tuple, device: torch.device) -> tuple[T
         raise ModelError(
             f"{preprocessing_file(folder)}: {key}",
             expected="three finite numbers" + (" above 0" if key == "image_std" else ""),
-            found=_excerpt(given[key]),
+            found=excerpt(given[key]),
             remedy="fetch the model again",
         )
     scale = _scale(settings)
     mean, std = (each.reshape(3, 1, 1).to(device) / scale for each in (mean, std))
     if settings.get("do_normalize") is False:
         mean, std = torch.zeros_like(mean), torch.ones_like(std) / scale
-    elif bool((mean > 1).any()):
+        return mean, std
+    usual = bool(((mean >= 0) & (mean <= 1)).all())
+    if not usual or bool(((std < _STD[0]) | (std > _STD[1])).any()):
+        key, what, least = keys[usual], ("means", "deviations")[usual], (0.0, _STD[0])[usual]
+        large = bool((mean > 1).any()) or bool((std > _STD[1]).any())
+        unscaled = ', or say "do_rescale": false if the images are not scaled' if large else ""
         raise ModelError(
-            f"{preprocessing_file(folder)}: image_mean",
-            expected=f"means within the colors 0 to {scale:g} of its images",
-            found=_excerpt(given["image_mean"]),
-            remedy='fetch the model again, or say "do_rescale": false if the images are not scaled',
+            f"{preprocessing_file(folder)}: {key}",
+            expected=f"{what} within the colors {least * scale:g} to {scale:g} of its images",
+            found=excerpt(given[key]),
+            remedy=f"fetch the model again{unscaled}",
         )
     return mean, std
 
@@ -196,12 +204,6 @@ def _three_numbers(value: Any) -> Tensor | None:
     except OverflowError:  # a whole number of hundreds of digits
         return None
     return numbers if bool(numbers.isfinite().all()) else None
-
-
-def _excerpt(value: Any) -> str:
-    """The begin of a JSON value, for a message."""
-    text = json.dumps(value)
-    return text if len(text) <= 80 else f"{text[:80]}..."
 
 
 def check_images(images: Tensor) -> None:

@@ -16,8 +16,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from lexsplat.features.hub import hash_without_settings, local_folder, model_folder
-from lexsplat.runtime.errors import FileFormatError, ModelError
+from lexsplat.features.hub import model_folder
+from lexsplat.runtime.errors import FileFormatError
 from lexsplat.runtime.files import read_tensors, write_tensors
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.runtime.user_cache import user_cache
@@ -58,24 +58,6 @@ def load_text(name: str, device: torch.device | str = "cpu") -> TextTower:
     from lexsplat.features.encoders import load_clip
 
     return load_clip(name, device)
-
-
-def check_encoder(name: str, content_hash: str, needed: str | None) -> None:
-    """Refuse an encoder whose hash is not that of the features; ``needed`` is None if that is unknown.
-
-    Settings of its tokenizer that came after the features make no other encoder of it.
-
-    Raises:
-        ModelError: It is another one.
-    """
-    folder = None if needed in (None, content_hash) else local_folder(name)
-    if needed not in (None, content_hash) and (folder is None or hash_without_settings(folder) != needed):
-        raise ModelError(
-            name,
-            expected="the encoder that the scene was built with",
-            found="another one",
-            remedy="give the right one with --clip, or build the scene again with this one",
-        )
 
 
 def encode_each(encoder: TextTower, texts: Sequence[str], listener: Listener = silent) -> Tensor:

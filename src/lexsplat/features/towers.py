@@ -29,7 +29,8 @@ _VIT_DEFAULTS = {
     "layer_norm_eps": 1e-12,
     "qkv_bias": True,
 }
-_MOST_LAYERS = 1000
+MOST_LAYERS = 256
+"""Layers of a tower, at most: a mistyped number would be built until the memory is full."""
 
 
 def settings_of(given: Any, defaults: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -41,7 +42,7 @@ def settings_of(given: Any, defaults: Mapping[str, Any]) -> dict[str, Any] | Non
     known = (
         all(isinstance(size, int) and 0 < size < 1 << 20 for size in sizes)
         and isinstance(settings["layer_norm_eps"], float)
-        and settings["num_hidden_layers"] <= _MOST_LAYERS
+        and settings["num_hidden_layers"] <= MOST_LAYERS
         and settings["hidden_size"] % settings["num_attention_heads"] == 0
         and settings["hidden_act"] in ACTIVATIONS
         and settings.get("num_channels", 3) == 3

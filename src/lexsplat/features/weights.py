@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import re
 import warnings
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,12 @@ _VIT_NAMES = (
 )
 """Names of timm and of the original DINO, and what transformers calls them."""
 
+_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_WHOLE_NUMBERS = re.compile(
+    r"((^|[._])(ids|index|mask)|num_batches_tracked|input_resolution|context_length|vocab_size)$"
+)
+"""Names of tensors that are no weights: places, masks, counts."""
+
 
 def first_weights(names: Collection[str]) -> str | None:
     """The file of `WEIGHTS` that is read, among the names of a folder's files; None if there is none."""
@@ -75,19 +82,30 @@ def weight_files(folder: Path) -> list[Path]:
     name = first_weights({path.name for path in folder.iterdir() if path.is_file()})
     if name != INDEX:
         return [] if name is None else [folder / name]
-    table = _index(folder / INDEX)
-    # Only files of the folder itself: shard names are not paths.
-    plain = all(isinstance(shard, str) and re.fullmatch(r"[\w.-]{1,200}", shard) for shard in table.values())
-    shards = sorted({folder / shard for shard in table.values()}) if plain else []
-    return shards if all(shard.is_file() for shard in shards) else []
+    return _shards(folder)[0]
 
 
-def _index(path: Path) -> dict[str, Any]:
+def fault_of_index(folder: Path) -> str:
+    """What is wrong with the index of a folder's shards, or with a shard of it; "" if nothing is."""
+    return _shards(folder)[1]
+
+
+def _shards(folder: Path) -> tuple[list[Path], str]:
+    """The shards that the index of a folder lists, or none and why."""
     try:
-        table = read_json(path).get("weight_map")
-    except (FileFormatError, AttributeError):
-        return {}
-    return table if isinstance(table, dict) else {}
+        table = read_json(folder / INDEX).get("weight_map")
+    except FileFormatError as error:
+        return [], f"{INDEX} that is no JSON ({error.found[:80]})"
+    except AttributeError:
+        table = None
+    if not isinstance(table, dict) or not table:
+        return [], f"{INDEX} without tensors in its weight_map"
+    for shard in table.values():  # only files of the folder itself: shard names are not paths
+        if not isinstance(shard, str) or not re.fullmatch(r"[\w.-]{1,200}", shard):
+            return [], f"{INDEX} with {excerpt(shard)} in place of the name of a file in its folder"
+    shards = sorted({folder / shard for shard in table.values()})
+    missing = [shard.name for shard in shards if not shard.is_file()]
+    return ([], f"no {_some(missing)}, which {INDEX} lists") if missing else (shards, "")
 
 
 def load_weights(folder: Path, name: str) -> dict[str, Tensor]:
@@ -101,12 +119,31 @@ def load_weights(folder: Path, name: str) -> dict[str, Tensor]:
         name: Name of the model in messages.
 
     Raises:
-        ModelError: If a file is damaged or holds anything but tensors.
+        ModelError: If a file is damaged, holds anything but tensors, or weights that are not plain floats.
     """
     state: dict[str, Tensor] = {}
     for path in weight_files(folder):
-        state.update(_pickled(path, name) if path.suffix == ".bin" else _safetensors(path, name))
+        found = _pickled(path, name) if path.suffix == ".bin" else _safetensors(path, name)
+        _check_floats(path, name, found)
+        state.update(found)
     return in_transformers_names(state)
+
+
+def _check_floats(path: Path, name: str, tensors: Mapping[str, Tensor]) -> None:
+    """Refuse quantized and sparse weights, which would be read as other numbers than they stand for."""
+    for key, tensor in tensors.items():
+        dense = tensor.layout == torch.strided
+        if dense and (tensor.dtype in _FLOATS or _WHOLE_NUMBERS.search(key)):
+            continue
+        found = str(tensor.dtype if dense else tensor.layout).removeprefix("torch.")
+        raise ModelError(
+            f"model {name}: {path.name}",
+            expected="weights in float16, bfloat16, float32 or float64",
+            found=f"{found} in {key}",
+            remedy="fetch the float version of the model in place of a quantized one"
+            if dense
+            else f"write it with dense tensors: {key}.to_dense()",
+        )
 
 
 def _safetensors(path: Path, name: str) -> dict[str, Tensor]:
@@ -222,6 +259,25 @@ def read_config(path: Path, what: str) -> dict[str, Any]:
     return content
 
 
+def towers_of(config: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """The settings of a configuration and of the towers within, each after its place, such as ``vision_config.``."""
+    waiting = [("", config)]
+    while waiting:
+        place, settings = waiting.pop(0)
+        yield place, settings
+        waiting += [
+            (f"{place}{key}.", value)
+            for key, value in settings.items()
+            if key.endswith(("_config", "_config_dict")) and isinstance(value, dict)
+        ]
+
+
+def excerpt(value: Any) -> str:
+    """The begin of a JSON value, for a message."""
+    text = json.dumps(value)
+    return text if len(text) <= 80 else f"{text[:80]}..."
+
+
 def _no_json(path: Path, what: str, found: str) -> ModelError:
     return ModelError(path, expected=f"{what} in JSON", found=found, remedy="fetch the model again")
 
@@ -243,6 +299,7 @@ def build_model(folder: Path, name: str, spare: str) -> Any:
     what = "a model configuration"
     kind_of_model = read_config(folder / "config.json", what).get("model_type")
     state = load_weights(folder, name)
+    damaged = ": config.json"  # what transformers has read when it fails
     try:
         config = AutoConfig.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
         # SAM 2 as it is published; its part for photos is a model of its own.
@@ -253,14 +310,16 @@ def build_model(folder: Path, name: str, spare: str) -> Any:
             config = Sam2Config(**{part: getattr(config, part) for part in parts})
         with torch.device("meta"):
             kind = type(AutoModel.from_config(config))
+        damaged = ""
         model, report = kind.from_pretrained(
             None, config=config, state_dict=state, output_loading_info=True, ignore_mismatched_sizes=True
         )
     except Exception as error:  # KeyError, OSError, ValueError, RuntimeError ...
         if not isinstance(kind_of_model, str):  # transformers may do without, by the name of the folder
             raise _no_json(folder / "config.json", what, "no model_type") from error
+        _check_activations(folder)
         raise ModelError(
-            f"model {name}",
+            f"model {name}{damaged}",
             expected="a model that transformers can load",
             found=f"{str(error)[:160]}",
             remedy="fetch it again, or choose another model",
@@ -281,6 +340,21 @@ def build_model(folder: Path, name: str, spare: str) -> Any:
             folder, name, "a config.json with all layers of the weights", f"no place for {_some(unmatched)}"
         )
     return model.float()  # some models are stored in half precision
+
+
+def _check_activations(folder: Path) -> None:
+    """Refuse an activation that transformers does not know, of which it says the name alone."""
+    from transformers.activations import ACT2FN
+
+    path = folder / "config.json"
+    for place, settings in towers_of(read_config(path, "a model configuration")):
+        value = settings.get("hidden_act")
+        if isinstance(value, str) and value not in ACT2FN:
+            expected = "an activation of transformers, such as quick_gelu or gelu"
+            remedy = "fetch config.json again, or choose another model"
+            raise ModelError(
+                f"{path}: {place}hidden_act", expected=expected, found=excerpt(value), remedy=remedy
+            )
 
 
 def _refuse(folder: Path, name: str, expected: str, found: str) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lexsplat.features.hub import content_hash, model_folder, present_name
-from lexsplat.features.text import check_encoder
+from lexsplat.features.same_encoder import check_encoder
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField, field_from_tensors
 from lexsplat.queries.relevancy import QueryConfig

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.features.hub import present_name
-from lexsplat.features.text import TextCache, TextTower, check_encoder, encode_each, load_text, texts_of_scene
+from lexsplat.features.same_encoder import under_hash_of_features
+from lexsplat.features.text import TextCache, TextTower, encode_each, load_text, texts_of_scene
 from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.geometry.world import World, world_of
@@ -196,9 +197,8 @@ class Scene:
         Raises:
             ModelError: If it cannot be loaded, or is another one.
         """
-        if self.text_tower is None:
-            self.text_tower = load_text(self.clip, str(self.gaussians.device))
-        check_encoder(self.clip, self.text_tower.content_hash, self._encoder_hash)
+        tower = self.text_tower or load_text(self.clip, str(self.gaussians.device))
+        self.text_tower = under_hash_of_features(self.clip, tower, self._encoder_hash)
         return self.text_tower
 
     def question(self, prompts: str | Sequence[str]) -> Question:
