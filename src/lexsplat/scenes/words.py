@@ -157,14 +157,12 @@ def completed(scene: Scene, prompt: str, word: Word) -> Word:
     if not found:
         return word
     whole = union(taken, found)
-    others = [
-        each
-        for each in scene.objects
-        if each not in named and (_is_scrap(each, taken) or _is_stranger(each, taken, noun_of(prompt)))
-    ]
-    left = union(taken, others)
+    noun = noun_of(prompt)
+    left = union(
+        taken, [each for each in scene.objects if each not in named and _is_too_much(each, taken, noun)]
+    )
     if not any(each.phrase in SURFACES for each in found):  # a table is listed without what few views show
-        left |= ~union(taken, scene.objects)
+        left |= ~_listed(scene)
     scores = torch.where(whole & ~taken, word.scores.clamp(min=MEMBER), word.scores)
     scores = torch.where(left & taken & ~whole, scores.clamp(max=BORDER - 1e-4), scores)
     return replace(word, scores=scores)
@@ -178,17 +176,24 @@ def _is_mostly(scene: Scene, thing: Selection, taken: Tensor) -> bool:
     return float((shown * taken[thing.indices]).sum()) >= _MOSTLY * float(shown.sum())
 
 
-def _is_scrap(other: Selection, taken: Tensor) -> bool:
-    """Whether a word takes a little of another thing, such as the upper edge of the books before a lamp."""
-    known = other.phrase not in SURFACES or other.phrase in CARRIERS
-    return known and 0 < int(taken[other.indices].sum()) < _PIECE * len(other)
+def _is_too_much(other: Selection, taken: Tensor, noun: str) -> bool:
+    """Whether a word takes what it should not of another thing.
+
+    That is a little of it, such as the upper edge of the books before a lamp, or much of what its noun is no likely
+    name of.
+    """
+    count = int(taken[other.indices].sum())
+    if count >= _PIECE * len(other):
+        return other.phrase not in SURFACES and noun not in likely_nouns(other)
+    return count > 0 and (other.phrase not in SURFACES or other.phrase in CARRIERS)
 
 
-def _is_stranger(other: Selection, taken: Tensor, noun: str) -> bool:
-    """Whether a word takes much of another thing that its noun is no likely name of."""
-    if other.phrase in SURFACES or noun in likely_nouns(other):
-        return False
-    return int(taken[other.indices].sum()) >= _PIECE * len(other)
+def _listed(scene: Scene) -> Tensor:
+    """The Gaussians ``[N]`` bool of any listed object."""
+    known: dict[str, Tensor] = scene.__dict__
+    if "_listed" not in known:
+        known["_listed"] = union(scene.hidden, scene.objects)
+    return known["_listed"]
 
 
 def likely_nouns(thing: Selection) -> set[str]:
