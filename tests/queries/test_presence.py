@@ -137,6 +137,16 @@ def test_objects_are_compared_and_not_their_parts(classifier):
     assert strength(classifier, "3") < NO, "a stripe of the ball"
 
 
+def test_a_listed_thing_is_a_place_of_its_own(classifier):
+    stripe = torch.zeros(1, len(classifier.language.codebook.clip))
+    stripe[0, 3] = 1
+    known = (make_scene(per_ball=100).gaussians, classifier.language, classifier.scale, Words())
+    listing = PresenceClassifier(*known, things=lambda: stripe)
+    assert strength(listing, "3") > YES, "the stripe, without the ball that its segment has"
+    assert strength(listing, "2") == pytest.approx(strength(classifier, "2"))
+    assert listing.places.words == classifier.places.words
+
+
 def test_compounds_need_the_strength_of_objects_and_colors_more(classifier, monkeypatch):
     from lexsplat.queries import presence
 

@@ -240,7 +240,7 @@ def test_a_folder_of_another_kind_is_refused_with_its_kind(tmp_path):
 
 @pytest.mark.parametrize("wrong", [5, None, ["demo"], b"demo"])
 def test_a_folder_that_is_no_path_is_refused_in_one_line(wrong):
-    with pytest.raises(SceneFolderError, match="expected the path of a scene folder"):
+    with pytest.raises(SceneFolderError, match="expected a scene folder's path"):
         open_scene(wrong)
 
 

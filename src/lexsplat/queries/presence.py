@@ -93,7 +93,8 @@ class DescribedPlaces(NamedTuple):
     """Where presence is decided.
 
     Args:
-        distributions: The scene's objects, and what no everyday word describes, as distributions ``[V, K]``.
+        distributions: The scene's objects, what no everyday word describes, and the things that are listed, as
+            distributions ``[V, K]``.
         words: The everyday words that describe the objects best.
     """
 
@@ -110,6 +111,7 @@ class PresenceClassifier:
         scale: Scores of everyday words in it.
         embed: Texts to embeddings ``[T, D]``.
         places: `places` of an earlier classifier of the same scene; None computes them when they are needed.
+        things: Distributions of the things that the scene lists ``[V, K]``; None lists none.
     """
 
     def __init__(
@@ -119,8 +121,9 @@ class PresenceClassifier:
         scale: EverydayScale,
         embed: Callable[[Sequence[str]], Tensor],
         places: DescribedPlaces | None = None,
+        things: Callable[[], Tensor] | None = None,
     ) -> None:
-        self.language, self.scale, self._embed = language, scale, embed
+        self.language, self.scale, self._embed, self._things = language, scale, embed, things
         self._shown = (gaussians.opacities >= FAINT).detach().nonzero()[:, 0]
         if places is not None:
             self.places = places
@@ -195,7 +198,10 @@ class PresenceClassifier:
 
     @cached_property
     def places(self) -> DescribedPlaces:
-        """The segments that everyday words describe as wholes, and those words."""
+        """The segments that everyday words describe as wholes, and those words; and listed things.
+
+        A thing is listed without the strip of cloth that its segment has, and so it is more like its name.
+        """
         codes, words = self.segment_codes, everyday_words()
         if codes is None:
             return DescribedPlaces(torch.zeros(0, len(self.language.codebook.clip)), ())
@@ -206,9 +212,10 @@ class PresenceClassifier:
         # What no word describes takes part with its lowest segments.
         places = np.unique(np.where(whole.places < 0, codes.numbers[0], whole.places))
         named = whole.words[np.unique(whole.places[whole.places >= 0])]
-        return DescribedPlaces(
-            codes.distributions[torch.from_numpy(places)], tuple(dict.fromkeys(words[word] for word in named))
-        )
+        found = codes.distributions[torch.from_numpy(places)]
+        if self._things is not None:
+            found = torch.cat([found, self._things().to(found)])
+        return DescribedPlaces(found, tuple(dict.fromkeys(words[word] for word in named)))
 
     @property
     def colored(self) -> list[str]:

@@ -301,6 +301,13 @@ def _is_connected(part: Selection, whole: Selection) -> bool:
     return bool(shares[0].argmax() == shares[1].argmax())
 
 
+def codes_of_things(scene: Scene) -> torch.Tensor:
+    """The mean codes ``[V, K]`` of the listed objects that are no surfaces."""
+    things = [thing for thing in scene.objects if thing.phrase not in SURFACES]
+    none = scene.field.codebook.clip.new_zeros(0, len(scene.field.codebook.clip))
+    return torch.stack([_mean_codes(scene, thing) for thing in things]) if things else none
+
+
 def _mean_codes(scene: Scene, thing: Selection) -> torch.Tensor:
     weights, field = shown_weights(scene)[thing.indices], scene.field.select(thing.indices)
     shares = weights / weights.sum().clamp_min(1e-12)

@@ -11,7 +11,7 @@ import os
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,7 @@ from lexsplat.scenes.asking import in_words_that_fit
 from lexsplat.scenes.finding import find_in, understood_in
 from lexsplat.scenes.folder import BUNDLED_SCENE, SceneFolder
 from lexsplat.scenes.kept import KeptObjects, kept_objects_of, seen_of
-from lexsplat.scenes.objects import objects_of
+from lexsplat.scenes.objects import codes_of_things, objects_of
 from lexsplat.scenes.reading import read_scene
 from lexsplat.scenes.views import StoredView, view_named
 from lexsplat.scenes.words import KEPT_GRAPHS, Word, new_words
@@ -370,7 +370,8 @@ class Scene:
     def presence_classifier(self) -> PresenceClassifier:
         """Decides whether the scene holds a phrase at all; made at first use."""
         if self._classifier is None:
-            known = (self.everyday_scale, self.embed, self.kept.places if self.kept else None)
+            places, things = self.kept.places if self.kept else None, partial(codes_of_things, self)
+            known = (self.everyday_scale, self.embed, places, things)
             self._classifier = PresenceClassifier(self.gaussians, self.field, *known)
         return self._classifier
 
@@ -444,7 +445,6 @@ def open_scene(path: str | Path, *, device: str = "auto", clip: str | None = Non
         ValueError: If the device is not one of the three.
     """
     if not isinstance(path, (str, os.PathLike)):
-        expected = "the path of a scene folder"
-        raise SceneFolderError(repr(path)[:60], expected=expected, found=type(path).__name__)
+        raise SceneFolderError(repr(path)[:60], expected="a scene folder's path", found=type(path).__name__)
     found = read_scene(Path(path), device)
     return Scene(found.gaussians, found.field, found.views, found.encoder(clip), found.query, found.folder)
