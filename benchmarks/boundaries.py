@@ -65,7 +65,9 @@ def main() -> None:
         print(f"level {level}: {segments:6,} segments, recall {recall:.3f}, chance {chance:.3f}")
     if options.sheet:
         columns = [
-            np.concatenate([flat(shown_segments(scene, view, level), outlines[view]) for view in outlines])
+            np.concatenate(
+                [in_flat_colors(shown_segments(scene, view, level), outlines[view]) for view in outlines]
+            )
             for level in options.sheet_levels
         ]
         Image.fromarray(np.concatenate(columns, 1)).save(options.sheet, optimize=True)
@@ -128,7 +130,7 @@ def drawn(scene: Scene, view: str, borders: Mask, outline: Mask) -> NDArray[np.u
     return pixels
 
 
-def flat(shown: NDArray[np.int64], outline: Mask) -> NDArray[np.uint8]:
+def in_flat_colors(shown: NDArray[np.int64], outline: Mask) -> NDArray[np.uint8]:
     """Segments in colors of their own, far apart for neighboring numbers, and outlines in black."""
     hues = np.arange(shown.max() + 1) * 0.618 % 1
     colors = [hsv_to_rgb(hue, 0.3 + 0.3 * (hue * 7 % 1), 0.95 - 0.3 * (hue * 13 % 1)) for hue in hues]

@@ -70,3 +70,14 @@ def test_features_that_do_not_match_the_photos_are_told_though_they_have_the_dep
     with caplog.at_level(logging.WARNING, logger="lexsplat"):
         check_given(config, capture, encoders)
     assert ("of another encoder, which --clip has to name" in caplog.text) is (change != "none")
+
+
+@pytest.mark.parametrize(("right", "told"), [(0.77, True), (0.83, False)])
+def test_maps_that_match_as_well_as_permuted_channels_are_told(tmp_path, caplog, monkeypatch, right, told):
+    capture, encoders = load_capture(CAPTURE), Encoders("bundled", "none", "cpu")
+    for view in capture.views.values():
+        np.save(tmp_path / f"{view.stem}.npy", np.ones((3, 4, encoders.clip.dim), np.float32))
+    monkeypatch.setattr("lexsplat.pipeline.encoding.rank_tiles", lambda *_: right)
+    with caplog.at_level(logging.WARNING, logger="lexsplat"):
+        check_given(BuildConfig(clip="bundled", dino="none", features_from=tmp_path), capture, encoders)
+    assert (f"by {right:.2f} only (expected 0.80" in caplog.text) is told
