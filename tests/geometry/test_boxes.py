@@ -155,6 +155,20 @@ def test_representatives_are_as_many_as_each_point_weighs(weights, most):
         assert np.abs(np.bincount(chosen, minlength=len(weights)) - expected).max() <= 1 + 1e-6
 
 
+def test_a_gaussian_more_or_less_does_not_move_the_thin_end_of_a_table():
+    random = np.random.default_rng(0)
+    dense = random.uniform((-1, -0.6, 0), (1, 0.6, 0.02), (5500, 3))
+    thin = random.uniform(
+        (-1, 0.6, 0), (1, 0.8, 0.02), (110, 3)
+    )  # 2 % of the points on a seventh of the length
+    table = random.permutation(np.concatenate([dense, thin]))
+    sizes = []
+    for gone in range(12):
+        left = np.delete(table, np.arange(gone) * 7, 0)
+        sizes.append(fit_box(left[representatives(np.ones(len(left)))], UP).half_sizes * 2)
+    assert np.ptp(sizes, axis=0).max() < 0.03  # .16 with as few points as of a thing
+
+
 def test_points_of_zero_weight_are_ignored():
     points = np.vstack([np.random.default_rng(0).uniform(-1, 1, (500, 3)), np.full((200, 3), 9.0)])
     chosen = representatives(np.r_[np.ones(500), np.zeros(200)])

@@ -121,6 +121,7 @@ def test_the_light_of_a_shadow_beside_the_hole_is_what_it_lacks_and_elsewhere_it
     assert np.abs(found[beside] * shadow[beside] - 1).mean() < 0.15
     np.testing.assert_array_equal(found[far], 1)
     assert found.min() >= 1, "nothing turns darker"
+    np.testing.assert_array_equal(light(original, hole, trust_outside(hole) * (away > 45)), 1)
     plain = np.full((SIZE, SIZE, 3), 0.4)
     np.testing.assert_array_equal(light(plain, hole, trust_outside(hole)), 1)
     assert np.abs(light(original, hole, trust_outside(hole)) - 1).max() < 0.15, (

@@ -20,6 +20,7 @@ from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.filling import fill_for
 from lexsplat.scenes.fills import Fill
 from lexsplat.scenes.journal import Step
+from lexsplat.scenes.materials import THING
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.views import StoredView
 
@@ -75,6 +76,28 @@ def test_a_deleted_thing_leaves_a_closed_surface_with_the_colors_around(turned):
     assert np.abs(colors[places[:, 0] < -0.15] - LEFT).max() < 0.15
     assert np.abs(colors[places[:, 0] > 0.15] - RIGHT).max() < 0.15
     assert not editor.scene.field.codes.any(), "the language of the table"
+
+
+def test_where_two_surfaces_meet_under_a_thing_each_goes_on_to_the_edge_and_things_on_them_are_not_copied():
+    scene, world = table_with_a_ball()
+    chosen = ball_of(scene, world)
+    means = scene.gaussians.means.numpy()
+    stain = (
+        np.hypot(means[:, 0] + 0.5, means[:, 1]) < 0.15
+    ) & ~chosen.mask.numpy()  # a thing, seen from above
+    scene.gaussians.sh0[torch.from_numpy(stain)] = 1.5
+    kinds = np.where(stain | chosen.mask.numpy(), THING, np.where(means[:, 0] < 0, 0, 1))
+    fill, _ = fill_for(chosen, kinds=kinds)
+    places, colors = fill.disks[:, :2], fill.disks[:, -3:]
+    apart = np.stack([np.abs(colors - each).max(1) for each in (LEFT, RIGHT)])
+    at_edge = np.abs(places[:, 0]) > 0.02
+    assert (apart.argmin(0) == (places[:, 0] > 0))[at_edge].mean() > 0.99
+    assert (apart.min(0) < 0.05).mean() > 0.95, (
+        "no mean of both, and nothing of the stain but its blurred rim"
+    )
+    mixed, _ = fill_for(chosen)
+    apart = np.abs(mixed.disks[:, None, -3:] - np.stack([LEFT, RIGHT])).max(2).min(1)
+    assert (apart < 0.05).mean() < 0.8, "as one surface"
 
 
 def test_a_moved_thing_leaves_the_surface_that_a_deleted_one_leaves(tmp_path):

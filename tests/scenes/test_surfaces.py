@@ -54,3 +54,28 @@ def test_few_and_uneven_points_of_a_table_make_a_plane_too_and_scattered_ones_do
     assert found.origin[2] == pytest.approx(0.5, abs=0.02)
     scattered = random.uniform((-0.35, -0.35, -1), (0.35, 0.35, 2), (120, 3))
     assert surface_below(thing, scattered, UP) is None
+
+
+def test_a_thing_whose_foot_is_hidden_stands_on_the_listed_surface_around_it():
+    """As a plant behind other things: few Gaussians of the table are near, and those of the things are higher."""
+    random = np.random.default_rng(4)
+    pot = random.uniform((-0.2, -0.2, 0.15), (0.2, 0.2, 0.8), (300, 3))
+    table = np.concatenate([random.uniform(-1, 1, (200, 2)), random.normal(0, 0.002, (200, 1))], 1)
+    table = table[np.linalg.norm(table[:, :2], axis=1) > 0.45]
+    leaves = random.uniform((-0.5, -0.5, 0.1), (0.5, 0.5, 0.5), (25, 3))
+    others = np.concatenate([table, leaves])
+    assert surface_below(pot, others, UP) is None
+    found = surface_below(pot, others, UP, table)
+    assert found.origin[2] == pytest.approx(0, abs=0.01)
+    assert found.axes[2] == pytest.approx(UP, abs=0.02)
+    assert surface_below(pot, others, UP, table + np.array([0, 0, 0.6])) is None, (
+        "a shelf above its foot carries nothing"
+    )
+
+
+@pytest.mark.parametrize("height", [0.05, 2.0])
+def test_the_image_from_above_reaches_as_far_as_a_tall_thing_casts_its_shadow(height):
+    thing, table = table_and_thing(600)
+    found = surface_below((thing - [0, 0, 0.5]) * [1, 1, height / 0.4] + [0, 0, 0.5], table, UP)
+    expected = max(surfaces.REACH * found.radius, 1.5 * height)
+    assert expected <= found.reach <= expected + found.radius

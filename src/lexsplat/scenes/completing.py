@@ -132,6 +132,8 @@ def light(image: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     if repeats is None:
         return np.ones(hole.shape)
     asked = (trust > 0) & (repeats.away <= _SHADOW + _FADE)
+    if not asked.any():
+        return np.ones(hole.shape)
     window = _window(asked)
     values, trusts = _candidates(image, trust, repeats, window)
     found = _first(repeats, values, trusts, trust, asked, _BRIGHT)

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lexsplat.geometry.gaussians import Gaussians
@@ -24,7 +25,7 @@ from lexsplat.language.fields import LanguageField
 from lexsplat.language.segments import Segments
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.visibility import whole_things, with_remains
-from lexsplat.runtime.errors import FileFormatError, QueryError, SceneFolderError
+from lexsplat.runtime.errors import FileFormatError, LexsplatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
 from lexsplat.scenes.colors import parse_color
@@ -35,6 +36,7 @@ from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.gone import gone_nouns
 from lexsplat.scenes.journal import CHANGES, Journal, Kind, Step, packed, unpacked
 from lexsplat.scenes.kept import keep_for
+from lexsplat.scenes.materials import UNLISTED, kinds_of_segments
 from lexsplat.scenes.recoloring import recolored
 from lexsplat.scenes.scene import Scene
 from lexsplat.scenes.transforms import Motion, transformed
@@ -328,8 +330,9 @@ class Editor:
         if fill:
             cameras = [view.camera for view in self.original.views.values() if view.split == "train"]
             things = replace(chosen, mask=gone, parts=())
+            scene = self.scene
             found, gone = fill_for(
-                things, cameras, self.original.listener, self.scene.hidden, self.scene.field.segments
+                things, cameras, self.original.listener, scene.hidden, scene.field.segments, self._kinds()
             )
             if found is not None:
                 values["fill"] = found.to_json()
@@ -348,6 +351,21 @@ class Editor:
                     found=str(left),
                     remedy="select less" if kind == "delete" else "select more",
                 )
+
+    def _kinds(self) -> NDArray[np.intp] | None:
+        """What each Gaussian is of ``[N]`` (`lexsplat.scenes.materials`), as the list of the original says.
+
+        None without a list: of a scene in memory, or if its encoder is not at hand. What is copied is unlisted.
+        """
+        before, now = self.original.field.segments, self.scene.field.segments
+        if before is None or now is None or self.original.folder is None:
+            return None
+        try:
+            kinds = kinds_of_segments(self.original.objects, before)
+        except LexsplatError:
+            return None
+        more = np.full(now.levels.shape[1] - len(kinds), UNLISTED)
+        return np.concatenate([kinds, more])[now.labels.cpu().numpy()]
 
     @contextmanager
     def _change(self, entry: dict[str, Any]) -> Iterator[None]:

@@ -36,6 +36,7 @@ from lexsplat.queries.selection import Selection
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.completing import completed, light
 from lexsplat.scenes.fills import MOST, Fill
+from lexsplat.scenes.materials import THING, UNLISTED, materials
 from lexsplat.scenes.surfaces import (
     FEWEST,
     REACH,
@@ -44,12 +45,14 @@ from lexsplat.scenes.surfaces import (
     Surface,
     Views,
     covering,
+    covers,
     from_above,
     photographed,
     surface_below,
 )
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 _FAINT = 0.1
@@ -91,6 +94,7 @@ def fill_for(
     listener: Listener = silent,
     hidden: Tensor | None = None,
     segments: Segments | None = None,
+    kinds: IntArray | None = None,
 ) -> tuple[Fill | None, Tensor]:
     """What closes the surfaces under a deleted selection, and the Gaussians that are deleted with it.
 
@@ -100,17 +104,20 @@ def fill_for(
         listener: Receives events of stage "fill", one unit a thing.
         hidden: Which Gaussians are hidden ``[N]`` bool; others that stand on a thing stay. None takes all as hidden.
         segments: The segments of the scene: the fill takes no language from things that stand on the surface.
+        kinds: What each Gaussian is of ``[N]``, as `lexsplat.scenes.materials.kinds_of_segments` says: surfaces meet
+            under a thing. None takes all for one surface.
 
     Returns:
         The fill, None if there is nothing to fill, and the selection with the remains under its things ``[N]`` bool.
     """
     gone = chosen.mask.cpu().numpy().copy()
     shown = np.zeros_like(gone) if hidden is None else ~hidden.cpu().numpy()
+    kinds = np.full(len(gone), UNLISTED) if kinds is None else kinds
     things, found, views = chosen.instances, list[Fill](), Views(chosen.gaussians, cameras)
     try:
         for done, thing in enumerate(things):
             listener(Event("fill", done, len(things)))
-            fill = _fill_below(thing, gone, shown, views, segments)
+            fill = _fill_below(thing, gone, shown, views, segments, kinds)
             found += [] if fill is None else [fill]
     finally:  # a viewer goes on after an error, and its bar ends
         listener(Event("fill", len(things), len(things)))
@@ -148,12 +155,14 @@ class _Place(NamedTuple):
     unknown: Mask
 
 
-def _place_of(thing: Selection, gone: Mask, views: Views) -> _Place | None:
+def _place_of(thing: Selection, gone: Mask, views: Views, kinds: IntArray) -> _Place | None:
     """Where a thing stands; None if it stands on nothing."""
     gaussians = thing.gaussians
     means = gaussians.means.detach().cpu().double().numpy()
     own, solid = thing.mask.cpu().numpy(), gaussians.opacities.detach().cpu().numpy() >= _FAINT
-    surface = surface_below(means[own & solid], means[~gone & solid], thing.up.direction)
+    surface = surface_below(
+        means[own & solid], means[~gone & solid], thing.up.direction, means[~gone & solid & (kinds >= 0)]
+    )
     if surface is None:
         return None
     local = (means - surface.origin) @ surface.axes.T
@@ -202,10 +211,15 @@ def _hole(place: _Place, flat: Mask, revealed: Mask) -> tuple[Mask, Mask, FloatA
 
 
 def _fill_below(
-    thing: Selection, gone: Mask, shown: Mask, views: Views, segments: Segments | None
+    thing: Selection,
+    gone: Mask,
+    shown: Mask,
+    views: Views,
+    segments: Segments | None,
+    kinds: IntArray,
 ) -> Fill | None:
     """The Gaussians that close the surface under one thing; remains there are added to ``gone [N]``."""
-    place = _place_of(thing, gone, views)
+    place = _place_of(thing, gone, views, kinds)
     if place is None:
         return None
     gaussians, surface, photo, local, solid = (
@@ -216,9 +230,11 @@ def _fill_below(
     hole, known, heights = _hole(place, flat & ~inside, revealed)
     if not hole.any() or known.sum() < FEWEST:
         return None
-    trust = known * (_UNSEEN + photo.shown)
-    factors = light(photo.colors, hole, trust)
-    painted = completed(photo.colors.clip(0, 1) * factors[..., None], hole, trust)
+    covered = covers(gaussians, surface, flat & ~inside, photo.cells, _groups(kinds))
+    labels, others = materials(covered, known)
+    if (known & ~others).sum() >= FEWEST:  # what stands on the surface is none of its pattern
+        known &= ~others
+    painted, factors = _painted(photo, hole, known, labels)
     thin = flat & (np.abs(local[:, 2]) <= _WAVES * surface.radius)  # a banana on a cloth is none of its waves
     near = np.linalg.norm(local[:, :2] - surface.foot, axis=1) <= REACH * surface.radius
     counted = solid & near & ~gone & (shown | ~shown.any())  # nobody knows what hidden Gaussians are
@@ -241,6 +257,38 @@ def _fill_below(
     same = np.tile([w, x, y, z, *np.log(photo.size * np.array(_SIZES))], (len(painted), 1))
     disks = np.concatenate([surface.origin + places @ surface.axes, same, painted], 1).astype("<f4")
     return Fill(members[nearest].astype("<i4"), disks, lit.astype("<i4"), by[lit].astype("<f4"))
+
+
+def _groups(kinds: IntArray) -> Mask:
+    """Which Gaussians ``[N]`` are of each surface, and of things ``[N, G + 1]``."""
+    return np.stack([*(kinds == number for number in range(kinds.max(initial=-1) + 1)), kinds == THING], 1)
+
+
+def _painted(photo: Orthophoto, hole: Mask, known: Mask, labels: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Colors of the pixels of a hole ``[F, 3]``, and the light that the surface lacks ``[P, P]``.
+
+    Each material continues itself.
+
+    Args:
+        photo: The surface from above.
+        hole: The pixels to paint ``[P, P]``.
+        known: The pixels whose colors count ``[P, P]``.
+        labels: The material of each pixel ``[P, P]``.
+    """
+    image, factors = photo.colors.clip(0, 1), np.ones(hole.shape)
+    trust = known * (_UNSEEN + photo.shown)
+    parts = [
+        (part, trust * part if (known & part).sum() >= FEWEST else trust)
+        for part in (labels == label for label in np.unique(labels))
+    ]
+    for part, sources in parts:
+        factors[part] = light(photo.colors, hole, sources)[part]
+    image = image * factors[..., None]
+    painted = image.copy()
+    for part, sources in parts:
+        if (hole & part).any():
+            painted[hole & part] = completed(image, hole & part, sources)
+    return painted[hole], factors
 
 
 def _of_surface(low: Mask, counted: Mask, segments: Segments | None) -> Mask:

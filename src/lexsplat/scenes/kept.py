@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("lexsplat")
 
-_SEEN_VERSION, _OBJECTS_VERSION = 1, 11
+_SEEN_VERSION, _OBJECTS_VERSION = 1, 12
 """Raised when the content of a file is computed in another way."""
 
 

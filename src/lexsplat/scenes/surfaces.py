@@ -28,8 +28,9 @@ Mask = NDArray[np.bool_]
 
 _FOOT = 0.15
 """The foot of a thing: its lowest share by height."""
-_RING = 1.0
-"""Width of the ring around the foot whose Gaussians make the plane, in radii of the foot."""
+_RING, _WIDE = 1.0, 3.0
+"""Width of the ring around the foot whose Gaussians make the plane, in radii of the foot: of all, and of those of
+surfaces only, where that is not enough."""
 _LEVELS = (0.1, 0.2)
 """Gaussians of the ring within this distance of the plane belong to it, in radii of the foot. The second is taken
 where too few are within the first: wood has few Gaussians."""
@@ -41,6 +42,7 @@ FEWEST = 30
 """Fewest Gaussians that make a plane, and fewest pixels that make a fill."""
 _PIXELS = (64, 112, 224)
 """Width of the image from above: at least, without views, and at most."""
+TALL = 1.5
 REACH = 3.0
 """Half of its width, in radii of the foot."""
 _VIEWS, _LONG_SIDE = 16, 240
@@ -67,15 +69,19 @@ class Surface(NamedTuple):
     axes: FloatArray
     foot: FloatArray
     radius: float
+    reach: float
 
 
-def surface_below(own: FloatArray, others: FloatArray, up: FloatArray) -> Surface | None:
+def surface_below(
+    own: FloatArray, others: FloatArray, up: FloatArray, listed: FloatArray | None = None
+) -> Surface | None:
     """The plane around the foot of a thing; None if there is none.
 
     Args:
         own: Means of the Gaussians of the thing ``[M, 3]``.
         others: Those of the Gaussians around it ``[R, 3]``.
         up: Unit vector ``[3]``.
+        listed: Those of listed surfaces ``[S, 3]``. Where too few of the others are near, these make the plane.
     """
     if len(own) < 4:
         return None
@@ -86,17 +92,23 @@ def surface_below(own: FloatArray, others: FloatArray, up: FloatArray) -> Surfac
     flat = foot @ np.stack([right, ahead]).T
     center = np.median(flat, 0)
     radius = max(float(np.quantile(np.linalg.norm(flat - center, axis=1), 0.9)), 1e-9)
-    apart = np.linalg.norm(others @ np.stack([right, ahead]).T - center, axis=1)
-    near = np.abs(others @ up - low) <= 0.5 * radius
-    ring = others[near & (apart <= (1 + _RING) * radius)]
-    planes = (_fitted_plane(ring, up, level * radius) for level in _LEVELS) if len(ring) >= FEWEST else ()
-    plane = next((each for each in planes if each is not None), None)
+    plane = None
+    for points, width, below in (
+        (others, _RING, 0.5),
+        (others[:0] if listed is None else listed, _WIDE, 1.0),
+    ):
+        apart = np.linalg.norm(points @ np.stack([right, ahead]).T - center, axis=1)
+        above = points @ up - low
+        near = (above >= -below * radius) & (above <= 0.5 * radius)
+        ring = points[near & (apart <= (1 + width) * radius)]
+        planes = (_fitted_plane(ring, up, level * radius) for level in _LEVELS) if len(ring) >= FEWEST else ()
+        plane = plane or next((each for each in planes if each is not None), None)
     if plane is None:
         return None
     origin, normal = plane
     axes = np.stack([*_across(normal), normal])
     middle = np.median((foot - origin) @ axes[:2].T, 0)
-    return Surface(origin, axes, middle, radius)
+    return Surface(origin, axes, middle, radius, max(REACH * radius, TALL * (high - low) + radius))
 
 
 def _fitted_plane(points: FloatArray, up: FloatArray, level: float) -> tuple[FloatArray, FloatArray] | None:
@@ -303,7 +315,24 @@ def from_above(
     gaussians: Gaussians, surface: Surface, members: Mask, cells: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Colors ``[P, P, 3]``, coverage and heights over the plane ``[P, P]`` of some Gaussians from far above."""
-    count, reach = len(cells), REACH * surface.radius
+    local = (gaussians.means.detach().cpu().double().numpy() - surface.origin) @ surface.axes[2]
+    image, alpha, heights = _drawn(gaussians, surface, members, cells, local[:, None])
+    safe = np.maximum(alpha, 1e-6)
+    return image / safe[..., None], alpha, heights[..., 0] / safe
+
+
+def covers(
+    gaussians: Gaussians, surface: Surface, members: Mask, cells: FloatArray, groups: Mask
+) -> FloatArray:
+    """How much of each pixel ``[P, P, G]`` some Gaussians cover from far above, by their groups ``[N, G]``."""
+    return _drawn(gaussians, surface, members, cells, groups.astype(float))[2]
+
+
+def _drawn(
+    gaussians: Gaussians, surface: Surface, members: Mask, cells: FloatArray, values: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """RGB ``[P, P, 3]``, coverage ``[P, P]`` and values ``[P, P, C]`` of some Gaussians from far above."""
+    count, reach = len(cells), surface.reach
     away = 100 * surface.radius
     rotation = surface.axes * np.array([[1.0], [-1.0], [-1.0]])
     eye = surface.origin + surface.foot @ surface.axes[:2] + away * surface.axes[2]
@@ -313,21 +342,18 @@ def from_above(
     K = np.array([[focal, 0, count / 2], [0, focal, count / 2], [0, 0, 1]])
     drawn = gaussians.select(torch.from_numpy(members).to(gaussians.device))
     drawn = replace(drawn, shN=torch.zeros_like(drawn.shN))
-    local = (drawn.means.detach().cpu().double().numpy() - surface.origin) @ surface.axes[2]
     with torch.no_grad():
-        height = torch.from_numpy(local)[:, None].to(drawn.means)
-        found = render(drawn, Camera(count, count, K, viewmat), features=height)
-    image, alpha, heights = (
-        one.cpu().double().numpy() for one in (found.image, found.alpha, found.features[..., 0])
+        features = torch.from_numpy(values[members]).to(drawn.means)
+        found = render(drawn, Camera(count, count, K, viewmat), features=features)
+    image, alpha, drawn_values = (
+        one.cpu().double().numpy() for one in (found.image, found.alpha, found.features)
     )
-    alpha = alpha.reshape(count, count)
-    safe = np.maximum(alpha, 1e-6)
-    return image / safe[..., None], alpha, heights / safe
+    return image, alpha.reshape(count, count), drawn_values
 
 
 def _cells(surface: Surface, cameras: Sequence[Camera]) -> tuple[FloatArray, float]:
     """The pixels of an image from above, about as fine as the views, and their width."""
-    reach = REACH * surface.radius
+    reach = surface.reach
     least, count, most = _PIXELS
     place = surface.origin + surface.foot @ surface.axes[:2]
     depths = [(camera.viewmat[2, :3] @ place + camera.viewmat[2, 3], camera.K[0, 0]) for camera in cameras]
