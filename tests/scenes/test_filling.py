@@ -87,17 +87,14 @@ def test_where_two_surfaces_meet_under_a_thing_each_goes_on_to_the_edge_and_thin
     ) & ~chosen.mask.numpy()  # a thing, seen from above
     scene.gaussians.sh0[torch.from_numpy(stain)] = 1.5
     kinds = np.where(stain | chosen.mask.numpy(), THING, np.where(means[:, 0] < 0, 0, 1))
-    fill, _ = fill_for(chosen, kinds=kinds)
-    places, colors = fill.disks[:, :2], fill.disks[:, -3:]
-    apart = np.stack([np.abs(colors - each).max(1) for each in (LEFT, RIGHT)])
-    at_edge = np.abs(places[:, 0]) > 0.02
-    assert (apart.argmin(0) == (places[:, 0] > 0))[at_edge].mean() > 0.99
-    assert (apart.min(0) < 0.05).mean() > 0.95, (
-        "no mean of both, and nothing of the stain but its blurred rim"
-    )
-    mixed, _ = fill_for(chosen)
-    apart = np.abs(mixed.disks[:, None, -3:] - np.stack([LEFT, RIGHT])).max(2).min(1)
-    assert (apart < 0.05).mean() < 0.8, "as one surface"
+
+    def wrong(fill):
+        places, colors = fill.disks[:, :2], fill.disks[:, -3:]
+        right = np.where(places[:, :1] < 0, LEFT, RIGHT)
+        return (np.abs(colors - right).max(1) > 0.05)[np.abs(places[:, 0]) > 0.08]  # beside the blurred edge
+
+    assert not wrong(fill_for(chosen, kinds=kinds)[0]).any()
+    assert wrong(fill_for(chosen)[0]).mean() > 0.2, "as one surface it copies the stain"
 
 
 def test_a_moved_thing_leaves_the_surface_that_a_deleted_one_leaves(tmp_path):
