@@ -7,7 +7,7 @@
 3. The pattern of the surface is continued in the hole (`lexsplat.scenes.completing`), in an image from above. Each
    painted pixel becomes a flat Gaussian. It takes the language of what it continues: of a neighbor in the surface,
    near by and of a like color (`_sources`). Under a thing at the edge of a cloth, a part of the fill is cloth and the
-   rest is table.
+   rest is table (`lexsplat.scenes.materials`); each continues itself.
 4. The surface around the hole keeps the shadow of the thing. Its Gaussians there are brightened
    (`lexsplat.scenes.completing.light`), and the fill continues what they are then.
 

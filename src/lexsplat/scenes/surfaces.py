@@ -42,9 +42,8 @@ FEWEST = 30
 """Fewest Gaussians that make a plane, and fewest pixels that make a fill."""
 _PIXELS = (64, 112, 224)
 """Width of the image from above: at least, without views, and at most."""
-TALL = 1.5
-REACH = 3.0
-"""Half of its width, in radii of the foot."""
+REACH, TALL = 3.0, 1.5
+"""Half of its width: at least so many radii of the foot, or heights of the thing and a radius, for its shadow."""
 _VIEWS, _LONG_SIDE = 16, 240
 """Number and longer side of the views that are looked at."""
 _BEFORE = 0.2
@@ -63,6 +62,7 @@ class Surface(NamedTuple):
         axes: Two unit vectors in it, and its normal, which points up ``[3, 3]`` in rows.
         foot: Center of the thing's foot in the two vectors ``[2]``.
         radius: Radius of the foot, world units.
+        reach: Half of the width of the image from above, world units.
     """
 
     origin: FloatArray
