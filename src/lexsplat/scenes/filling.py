@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -84,6 +84,8 @@ _ALIKE = 50.0
 """Difference of colors in CIELAB that is as far as a radius of the foot, where a fill takes its language."""
 _FLAT, _LARGE = 0.5, 0.25
 """A segment of which less is flat rises from the surface, unless it is this share of the scene, as a group is."""
+_MIXED = 2
+"""Pixels around the edge between two surfaces in which their colors are mixed, and are no source."""
 _LEAST_LIGHT = 0.01
 """Change of brightness below which a Gaussian stays as it is: nobody sees it, and a step lists each that changes."""
 
@@ -277,10 +279,10 @@ def _painted(photo: Orthophoto, hole: Mask, known: Mask, labels: IntArray) -> tu
     """
     image, factors = photo.colors.clip(0, 1), np.ones(hole.shape)
     trust = known * (_UNSEEN + photo.shown)
-    parts = [
-        (part, trust * part if (known & part).sum() >= FEWEST else trust)
-        for part in (labels == label for label in np.unique(labels))
-    ]
+    parts = []
+    for part in (labels == label for label in np.unique(labels)):
+        pure = binary_erosion(part, iterations=_MIXED, border_value=1)
+        parts.append((part, trust * pure if (known & pure).sum() >= FEWEST else trust))
     for part, sources in parts:
         factors[part] = light(photo.colors, hole, sources)[part]
     image = image * factors[..., None]
