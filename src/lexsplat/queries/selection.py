@@ -436,7 +436,9 @@ class Selection:
         firm = opacities >= FAINT
         counted = None if self.seen is None else self.seen.counted(self.indices)
         labels = divided(points, firm, clusters(points, firm, counted), self.up.direction)
-        labels = with_pieces(self.selected, labels, opacities, surface=is_divided(self.phrase))
+        if labels.any():
+            shapes = replace(self.gaussians, shN=self.gaussians.shN[:, :0]).select(self.indices)
+            labels = with_pieces(shapes, labels, opacities, surface=is_divided(self.phrase))
         return labels, np.bincount(labels, weights=opacities).astype(np.float64)
 
 

@@ -194,5 +194,6 @@ def _is_one_edit(one: str, other: str) -> bool:
     return any(long[:place] + long[place + 1 :] == short for place in range(len(long)))
 
 
+@lru_cache(1 << 14)  # of each known word, for each word that is asked for
 def _undoubled(word: str) -> str:
     return re.sub(r"(.)\1", r"\1", word)
