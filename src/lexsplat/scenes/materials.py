@@ -84,7 +84,8 @@ def materials(covered: FloatArray, known: Mask) -> tuple[IntArray, Mask]:
 def continued(found: IntArray) -> IntArray:
     """Materials ``[P, P]`` where they are not known, too.
 
-    The smallest shape that a pixel lies in is its material; outside of all it is the nearest one.
+    The smallest shape that a pixel lies in is its material; outside of all it is the nearest one. So it is among
+    several materials of which no edge is seen.
 
     Args:
         found: The materials, numbered from 0; -1 where they are not known ``[P, P]``.
@@ -96,8 +97,10 @@ def continued(found: IntArray) -> IntArray:
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     filled = found[tuple(nearest)]
     shapes = [(outline(found == name, known & (found != name)), name) for name in names]
+    endless = sum(bool(shape.all()) for shape, _ in shapes)
     for shape, name in sorted(shapes, key=lambda each: -each[0].sum()):
-        filled[~known & shape] = name
+        if endless < 2 or not shape.all():
+            filled[~known & shape] = name
     return filled
 
 

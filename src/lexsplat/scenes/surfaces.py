@@ -325,13 +325,21 @@ def covers(
     gaussians: Gaussians, surface: Surface, members: Mask, cells: FloatArray, groups: Mask
 ) -> FloatArray:
     """How much of each pixel ``[P, P, G]`` some Gaussians cover from far above, by their groups ``[N, G]``."""
-    return _drawn(gaussians, surface, members, cells, groups.astype(float))[2]
+    return _drawn(gaussians, surface, members, cells, groups)[2]
 
 
 def _drawn(
-    gaussians: Gaussians, surface: Surface, members: Mask, cells: FloatArray, values: FloatArray
+    gaussians: Gaussians, surface: Surface, members: Mask, cells: FloatArray, values: FloatArray | Mask
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """RGB ``[P, P, 3]``, coverage ``[P, P]`` and values ``[P, P, C]`` of some Gaussians from far above."""
+    """RGB ``[P, P, 3]``, coverage ``[P, P]`` and values ``[P, P, C]`` of some Gaussians from far above.
+
+    Args:
+        gaussians: The scene.
+        surface: The plane.
+        members: The Gaussians that are drawn ``[N]``.
+        cells: Places of the pixels ``[P, P, 2]``.
+        values: The values of all Gaussians ``[N, C]``.
+    """
     count, reach = len(cells), surface.reach
     away = 100 * surface.radius
     rotation = surface.axes * np.array([[1.0], [-1.0], [-1.0]])
