@@ -65,7 +65,7 @@ def kinds_of_segments(objects: Iterable[Selection], segments: Segments) -> IntAr
 
 
 def materials(covered: FloatArray, known: Mask) -> tuple[IntArray, Mask]:
-    """The material of each pixel ``[P, P]``, and the known pixels in which things are ``[P, P]``.
+    """The material of each pixel ``[P, P]``, and the pixels in and around things ``[P, P]``.
 
     Args:
         covered: How much of each pixel the Gaussians of each surface cover, and those of things ``[P, P, G + 1]``.
@@ -73,8 +73,7 @@ def materials(covered: FloatArray, known: Mask) -> tuple[IntArray, Mask]:
     """
     soft = np.stack([gaussian_filter(layer * known, _SMOOTH) for layer in np.moveaxis(covered, -1, 0)], -1)
     found = np.where(known & (soft.max(-1) > 0), soft.argmax(-1), -1)
-    things = found == covered.shape[-1] - 1
-    things = binary_dilation(things, iterations=_BLURRED) if things.any() and _BLURRED else things
+    things = binary_dilation(found == covered.shape[-1] - 1, iterations=_BLURRED)
     found[things] = -1
     counts = np.bincount(found[found >= 0], minlength=covered.shape[-1])
     found[np.isin(found, np.flatnonzero(counts < _LEAST * known.sum()))] = -1
