@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lexsplat.scenes.completing import completed, light, painted, self_similar_shifts
+from lexsplat.scenes.completing import brightening, completed, painted, self_similar_shifts
 
 SIZE, SQUARE, TURN = 112, 9.3, 0.4
 WHITE, BLUE, WOOD = np.array([0.8, 0.78, 0.75]), np.array([0.15, 0.35, 0.75]), np.array([0.6, 0.4, 0.25])
@@ -116,14 +116,14 @@ def test_a_pattern_goes_on_with_sharp_edges_and_the_same_each_time():
 def test_the_light_of_a_shadow_beside_the_hole_is_what_it_lacks_and_elsewhere_it_is_1():
     original, (hole, away) = checkers(), disk(14)
     shadow = 1 - 0.4 * np.exp(-((np.maximum(away - 14, 0) / 8) ** 2))
-    found = light(original * shadow[..., None], hole, trust_outside(hole))
+    found = brightening(original * shadow[..., None], hole, trust_outside(hole))
     beside, far = (away > 15) & (away < 18), away > 45
     assert np.abs(found[beside] * shadow[beside] - 1).mean() < 0.15
     np.testing.assert_array_equal(found[far], 1)
     assert found.min() >= 1, "nothing turns darker"
-    np.testing.assert_array_equal(light(original, hole, trust_outside(hole) * (away > 45)), 1)
+    np.testing.assert_array_equal(brightening(original, hole, trust_outside(hole) * (away > 45)), 1)
     plain = np.full((SIZE, SIZE, 3), 0.4)
-    np.testing.assert_array_equal(light(plain, hole, trust_outside(hole)), 1)
-    assert np.abs(light(original, hole, trust_outside(hole)) - 1).max() < 0.15, (
+    np.testing.assert_array_equal(brightening(plain, hole, trust_outside(hole)), 1)
+    assert np.abs(brightening(original, hole, trust_outside(hole)) - 1).max() < 0.15, (
         "without a shadow nothing changes"
     )

@@ -23,6 +23,8 @@ COLOR_WORDS = tuple(dict.fromkeys(word for word, _ in _EXAMPLES))
 _XYZ = np.array(
     [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
 )
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Weights of red, green and blue in the brightness of a color."""
 _DAYLIGHT = np.array([0.95047, 1.0, 1.08883])
 _LIGHTNESS = 0.5
 """Weight of the difference of lightness; that of hue and chroma is 1. Shading changes lightness most."""

@@ -12,6 +12,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lexsplat.queries.colors import LUMINANCE
+
 _LIGHTNESS = (0.16, 0.96)
 _HUES = (285.0, 465.0)
 _SATURATION = 0.92
@@ -85,7 +87,7 @@ def overlay_heatmap(image: ArrayLike, relevancy: ArrayLike) -> NDArray[np.uint8]
     scale = 1 / 255 if pixels.dtype == np.uint8 else 1.0
     colors = np.clip(pixels.astype(np.float32) * scale, 0, 1)
     amount = _unit(values, 0.0, max(float(values.max()), PEAK_FLOOR))
-    gray = colors @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+    gray = colors @ LUMINANCE.astype(np.float32)
     backdrop = 0.55 * (0.65 * gray[..., None] + 0.35 * colors) + 0.06
     weight = (0.85 * amount**0.8)[..., None]
     blended = (1 - weight) * backdrop + weight * (colorize(amount).astype(np.float32) / 255)

@@ -24,10 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d, minimum_filter
 
+from lexsplat.queries.colors import LUMINANCE
+
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _SHIFTS = 40
 _LEAST = 5
 """Shortest shift in pixels: neighboring pixels are similar without any pattern."""
@@ -77,7 +78,7 @@ def _repeats(image: FloatArray, hole: Mask, trust: FloatArray) -> _Repeats | Non
     """How an image repeats itself around a hole; None if it does not."""
     radius = max(float(np.sqrt(hole.sum() / np.pi)), 2.0)
     away = np.asarray(distance_transform_edt(~hole)) / radius
-    brightness = mean_around(image @ _LUMINANCE, trust, _BRIGHTNESS * radius)
+    brightness = mean_around(image @ LUMINANCE, trust, _BRIGHTNESS * radius)
     pattern = (image / np.maximum(brightness, 0.02)[..., None]).clip(0, 3)
     rim = trust * np.exp(-((away / _RIM) ** 2))
     mean = (rim[..., None] * pattern).sum((0, 1)) / rim.sum()
@@ -116,7 +117,7 @@ def completed(image: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     return np.asarray((share * colors + (1 - share) * smooth).clip(0, 1))
 
 
-def light(image: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
+def brightening(image: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     """The factor ``[H, W]`` by which a hole's surroundings would be brighter without the shadow on them; at least 1.
 
     It compares the brightness of each pixel near the hole with that of the pixels to which the shifts lead. Further
@@ -138,9 +139,9 @@ def light(image: FloatArray, hole: Mask, trust: FloatArray) -> FloatArray:
     values, trusts = _candidates(image, trust, repeats, window)
     found = _first(repeats, values, trusts, trust, asked, _BRIGHT)
     there = np.zeros(hole.shape)
-    there[asked] = found[asked[window], :3] @ _LUMINANCE
+    there[asked] = found[asked[window], :3] @ LUMINANCE
     expected, actual = (
-        mean_around(each, trust * asked, _SOFTNESS * repeats.radius) for each in (there, image @ _LUMINANCE)
+        mean_around(each, trust * asked, _SOFTNESS * repeats.radius) for each in (there, image @ LUMINANCE)
     )
     brightest = np.quantile(image[trust > 0].max(-1), _WHITE)
     limit = (brightest / np.maximum(image.max(-1), 0.02)).clip(1, _MOST)
@@ -283,7 +284,7 @@ def _voted(values: FloatArray, errors: FloatArray, trusts: FloatArray, share: fl
     least = np.where(trusts > 0, errors, np.inf).min(1)
     least = np.where(np.isfinite(least), least, 0.0)[:, None]
     weights = trusts * np.exp(-(errors - least) / (_SOFT * least + 1e-9))
-    order = (values[..., :3] @ _LUMINANCE).argsort(1)
+    order = (values[..., :3] @ LUMINANCE).argsort(1)
     sums = np.take_along_axis(weights, order, 1).cumsum(1)
     middle = (sums >= share * sums[:, -1:]).argmax(1)
     rows = np.arange(len(values))

@@ -12,6 +12,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +21,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.segments import Segments
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.visibility import whole_things, with_remains
+from lexsplat.queries.vocabulary import is_divided
 from lexsplat.runtime.errors import FileFormatError, LexsplatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
+from lexsplat.runtime.progress import Event
+from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.colors import parse_color
 from lexsplat.scenes.filling import fill_for
 from lexsplat.scenes.fills import Fill
@@ -36,9 +41,11 @@ from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.gone import gone_nouns
 from lexsplat.scenes.journal import CHANGES, Journal, Kind, Step, packed, unpacked
 from lexsplat.scenes.kept import keep_for
-from lexsplat.scenes.materials import UNLISTED, kinds_of_segments
+from lexsplat.scenes.materials import THING, UNLISTED, kinds_of_segments
 from lexsplat.scenes.recoloring import recolored
 from lexsplat.scenes.scene import Scene
+from lexsplat.scenes.shadows import Light, find_light
+from lexsplat.scenes.surfaces import Views
 from lexsplat.scenes.transforms import Motion, transformed
 
 _STILL = Motion()
@@ -46,6 +53,8 @@ MAX_GROWTH = 16
 """Largest number of Gaussians after edits, as a multiple of the original: copies of copies would fill the memory."""
 FEWEST = 2
 """Smallest number of Gaussians after an edit; pages draw no fewer."""
+_VIEWS_OF_LIGHT = 8
+"""Views that show how bright surfaces are."""
 
 
 def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Gaussians, LanguageField]:
@@ -121,6 +130,11 @@ def _with_segments(language: LanguageField, segments: Segments | None) -> Langua
     changed = copy.copy(language)
     changed.segments = segments
     return changed
+
+
+def _training(scene: Scene) -> list[Camera]:
+    """The views that a scene was made from."""
+    return [view.camera for view in scene.views.values() if view.split == "train"]
 
 
 class Editor:
@@ -328,11 +342,17 @@ class Editor:
         mask = self.planned_mask(kind, chosen)
         gone = self.planned_mask("delete", chosen) if kind in ("delete", "move") else mask
         if fill:
-            cameras = [view.camera for view in self.original.views.values() if view.split == "train"]
             things = replace(chosen, mask=gone, parts=())
-            scene = self.scene
+            scene, listener = self.scene, self.original.listener
+            listener(Event("fill", 0, len(things.instances)))
             found, gone = fill_for(
-                things, cameras, self.original.listener, scene.hidden, scene.field.segments, self._kinds()
+                things,
+                _training(self.original),
+                listener,
+                scene.hidden,
+                scene.field.segments,
+                self._kinds(),
+                self._light,
             )
             if found is not None:
                 values["fill"] = found.to_json()
@@ -352,20 +372,43 @@ class Editor:
                     remedy="select less" if kind == "delete" else "select more",
                 )
 
-    def _kinds(self) -> NDArray[np.intp] | None:
-        """What each Gaussian is of ``[N]`` (`lexsplat.scenes.materials`), as the list of the original says.
+    @cached_property
+    def _listed(self) -> NDArray[np.intp] | None:
+        """What each segment of the original is (`lexsplat.scenes.materials.kinds_of_segments`), as its list says.
 
-        None without a list: of a scene in memory, or if its encoder is not at hand. What is copied is unlisted.
+        None without a list: of a scene in memory, or if its encoder is not at hand.
         """
-        before, now = self.original.field.segments, self.scene.field.segments
-        if before is None or now is None or self.original.folder is None:
+        segments = self.original.field.segments
+        if segments is None or self.original.folder is None:
             return None
         try:
-            kinds = kinds_of_segments(self.original.objects, before)
+            return kinds_of_segments(self.original.objects, segments)
         except LexsplatError:
             return None
-        more = np.full(now.levels.shape[1] - len(kinds), UNLISTED)
-        return np.concatenate([kinds, more])[now.labels.cpu().numpy()]
+
+    def _kinds(self) -> NDArray[np.intp] | None:
+        """What each Gaussian is of ``[N]``; None without a list. What is copied is unlisted."""
+        now = self.scene.field.segments
+        if self._listed is None or now is None:
+            return None
+        more = np.full(now.levels.shape[1] - len(self._listed), UNLISTED)
+        return np.concatenate([self._listed, more])[now.labels.cpu().numpy()]
+
+    @cached_property
+    def _light(self) -> Light | None:
+        """The light of the original; None without a list, or if its shadows do not tell."""
+        scene = self.original
+        if self._listed is None or scene.field.segments is None:
+            return None
+        things = [each for each in scene.objects if not is_divided(each.phrase)]
+        if not things:
+            return None
+        kinds = self._listed[scene.field.segments.labels.cpu().numpy()]
+        standing = torch.from_numpy(kinds == THING) & ~scene.hidden.cpu()
+        means = scene.gaussians.means.detach().cpu()[standing].double().numpy()
+        views = Views(scene.gaussians, evenly(_training(scene), _VIEWS_OF_LIGHT))
+        size = float(np.median([np.median(each.size) for each in things]))
+        return find_light(views, kinds, means, things[0].up.direction, size)
 
     @contextmanager
     def _change(self, entry: dict[str, Any]) -> Iterator[None]:

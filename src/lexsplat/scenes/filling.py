@@ -8,8 +8,9 @@
    painted pixel becomes a flat Gaussian. It takes the language of what it continues: of a neighbor in the surface,
    near by and of a like color (`_sources`). Under a thing at the edge of a cloth, a part of the fill is cloth and the
    rest is table (`lexsplat.scenes.materials`); each continues itself.
-4. The surface around the hole keeps the shadow of the thing. Its Gaussians there are brightened
-   (`lexsplat.scenes.completing.light`), and the fill continues what they are then.
+4. The surfaces around keep the shadow of the thing. Their Gaussians there are brightened, and the fill continues what
+   they are then: by the light that the shadows of all things tell (`lexsplat.scenes.shadows`), else by what the
+   pattern is elsewhere (`lexsplat.scenes.completing.brightening`).
 
 Where no plane is found, such as below a hanging lamp, nothing is filled.
 """
@@ -28,15 +29,16 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lexsplat.geometry.cameras import Camera
-from lexsplat.geometry.gaussians import SH_C0
+from lexsplat.geometry.gaussians import SH_C0, Gaussians
 from lexsplat.geometry.hulls import GROWN, inside_hull
 from lexsplat.language.segments import Segments
 from lexsplat.queries.colors import cielab
 from lexsplat.queries.selection import Selection
 from lexsplat.runtime.progress import Event, Listener, silent
-from lexsplat.scenes.completing import completed, light
-from lexsplat.scenes.fills import MOST, Fill
+from lexsplat.scenes.completing import brightening, completed
+from lexsplat.scenes.fills import COLUMNS, MOST, Fill
 from lexsplat.scenes.materials import THING, UNLISTED, materials
+from lexsplat.scenes.shadows import Light, Shadows
 from lexsplat.scenes.surfaces import (
     FEWEST,
     REACH,
@@ -72,6 +74,8 @@ _NEAR = 8
 """Gaussians of a thing, nearest from above, that tell its height at a place."""
 _BARE = 0.6
 """Coverage below which a pixel is bare."""
+_VOID = (0.2, 0.5)
+"""A pixel that is covered less than this, though more than so many of the views see it, is beyond the surface's end."""
 _UNSEEN = 0.3
 """Trust in a pixel that no view sees. Another one gains the share of the views that see it."""
 _SIZES = (0.8, 0.8, 0.1)
@@ -97,6 +101,7 @@ def fill_for(
     hidden: Tensor | None = None,
     segments: Segments | None = None,
     kinds: IntArray | None = None,
+    light: Light | None = None,
 ) -> tuple[Fill | None, Tensor]:
     """What closes the surfaces under a deleted selection, and the Gaussians that are deleted with it.
 
@@ -108,6 +113,7 @@ def fill_for(
         segments: The segments of the scene: the fill takes no language from things that stand on the surface.
         kinds: What each Gaussian is of ``[N]``, as `lexsplat.scenes.materials.kinds_of_segments` says: surfaces meet
             under a thing. None takes all for one surface.
+        light: The light of the scene; None guesses shadows from the pattern around a thing.
 
     Returns:
         The fill, None if there is nothing to fill, and the selection with the remains under its things ``[N]`` bool.
@@ -115,18 +121,47 @@ def fill_for(
     gone = chosen.mask.cpu().numpy().copy()
     shown = np.zeros_like(gone) if hidden is None else ~hidden.cpu().numpy()
     kinds = np.full(len(gone), UNLISTED) if kinds is None else kinds
-    things, found, views = chosen.instances, list[Fill](), Views(chosen.gaussians, cameras)
+    shadows = None if light is None else _shadows(light, chosen, kinds)
+    scene = _Scene(Views(chosen.gaussians, cameras), shown, segments, kinds, shadows)
+    things, found = chosen.instances, list[Fill]()
     try:
         for done, thing in enumerate(things):
             listener(Event("fill", done, len(things)))
-            fill = _fill_below(thing, gone, shown, views, segments, kinds)
+            fill = _fill_below(thing, gone, scene)
             found += [] if fill is None else [fill]
+        if shadows is not None:
+            found.append(_without_shadow(chosen.gaussians, gone, kinds, shadows))
     finally:  # a viewer goes on after an error, and its bar ends
         listener(Event("fill", len(things), len(things)))
     mask = torch.from_numpy(gone).to(chosen.mask.device)
-    if not found:
+    if not any(len(fill.disks) + len(fill.lit) for fill in found):
         return None, mask
     return Fill(*(np.concatenate(rows)[:MOST] for rows in zip(*found))), mask
+
+
+class _Scene(NamedTuple):
+    """What is known of a scene: see `fill_for`.
+
+    Args:
+        views: The scene and its views.
+        shown: The Gaussians that are not hidden ``[N]``.
+        segments: Its segments.
+        kinds: What each Gaussian is of ``[N]``.
+        shadows: The shadows of what is deleted and of other things; None if the light is not known.
+    """
+
+    views: Views
+    shown: Mask
+    segments: Segments | None
+    kinds: IntArray
+    shadows: Shadows | None
+
+
+def _shadows(light: Light, chosen: Selection, kinds: IntArray) -> Shadows:
+    means = chosen.gaussians.means.detach().cpu().double().numpy()
+    solid = chosen.gaussians.opacities.detach().cpu().numpy() >= _FAINT
+    own = chosen.mask.cpu().numpy()
+    return Shadows(light, means[own & solid], means[~own & solid & (kinds == THING)])
 
 
 class _Place(NamedTuple):
@@ -207,58 +242,63 @@ def _hole(place: _Place, flat: Mask, revealed: Mask) -> tuple[Mask, Mask, FloatA
     filled = binary_dilation(place.unseen, iterations=_OVERLAP)
     around = near | place.unknown | binary_dilation(filled, iterations=_OVERLAP)
     hole = filled | (around & (coverage < _BARE))
+    hole &= ~((place.photo.coverage < _VOID[0]) & (place.photo.shown > _VOID[1]))
     level = np.abs(heights) <= THICK * radius
     known = (coverage >= _BARE) & level & ~binary_dilation(hole, iterations=_RIM)
     return hole, known, heights
 
 
-def _fill_below(
-    thing: Selection,
-    gone: Mask,
-    shown: Mask,
-    views: Views,
-    segments: Segments | None,
-    kinds: IntArray,
-) -> Fill | None:
+def _fill_below(thing: Selection, gone: Mask, scene: _Scene) -> Fill | None:
     """The Gaussians that close the surface under one thing; remains there are added to ``gone [N]``."""
-    place = _place_of(thing, gone, views, kinds)
+    place = _place_of(thing, gone, scene.views, scene.kinds)
     if place is None:
         return None
-    gaussians, surface, photo, local, solid = (
-        thing.gaussians, place.surface, place.photo, place.local, place.solid
-    )  # fmt: skip
-    flat = ~gone & solid & place.level
-    inside, revealed = _remains(place, gone, shown)
+    surface, photo, local = place.surface, place.photo, place.local
+    flat = ~gone & place.solid & place.level
+    inside, revealed = _remains(place, gone, scene.shown)
     hole, known, heights = _hole(place, flat & ~inside, revealed)
     if not hole.any() or known.sum() < FEWEST:
         return None
-    covered = covers(gaussians, surface, flat & ~inside, photo.cells, _groups(kinds))
+    covered = covers(thing.gaussians, surface, flat & ~inside, photo.cells, _groups(scene.kinds))
     labels, others = materials(covered, known)
     if (known & ~others).sum() >= FEWEST:  # what stands on the surface is none of its pattern
         known &= ~others
-    painted, factors = _painted(photo, hole, known, labels)
-    thin = flat & (np.abs(local[:, 2]) <= _WAVES * surface.radius)  # a banana on a cloth is none of its waves
+    painted, factors = _painted(place, hole, known, labels, scene.shadows)
     near = np.linalg.norm(local[:, :2] - surface.foot, axis=1) <= REACH * surface.radius
-    counted = solid & near & ~gone & (shown | ~shown.any())  # nobody knows what hidden Gaussians are
-    low = counted & (local[:, 2] <= _WAVES * surface.radius)
-    surfaces = _of_surface(low, counted, segments)
+    # nobody knows what hidden Gaussians are
+    counted = place.solid & near & ~gone & (scene.shown | ~scene.shown.any())
+    surfaces = _of_surface(counted & (local[:, 2] <= _WAVES * surface.radius), counted, scene.segments)
+    thin = flat & (np.abs(local[:, 2]) <= _WAVES * surface.radius)  # a banana on a cloth is none of its waves
     members = np.flatnonzero(thin & ~inside & counted & surfaces)
     if not len(members):
         members = np.flatnonzero(flat & ~inside)
     gone |= inside
     by = np.where(flat & surfaces & ~gone, _at(factors, local[:, :2], photo), 1.0)
-    lit = np.flatnonzero(by > 1 + _LEAST_LIGHT)
     waves = known & (np.abs(heights) <= _WAVES * surface.radius)
     raised = _continued(heights, hole, waves if waves.sum() >= FEWEST else known)
     places = np.concatenate([photo.cells[hole], raised[:, None]], 1)
-    colors = gaussians.sh0.detach().cpu().double().numpy()[members, 0] * SH_C0 + 0.5
+    colors = thing.gaussians.sh0.detach().cpu().double().numpy()[members, 0] * SH_C0 + 0.5
     nearest = _sources(
         local[members, :2] / surface.radius, colors, photo.cells[hole] / surface.radius, painted
     )
     x, y, z, w = Rotation.from_matrix(surface.axes.T).as_quat()
     same = np.tile([w, x, y, z, *np.log(photo.size * np.array(_SIZES))], (len(painted), 1))
     disks = np.concatenate([surface.origin + places @ surface.axes, same, painted], 1).astype("<f4")
-    return Fill(members[nearest].astype("<i4"), disks, lit.astype("<i4"), by[lit].astype("<f4"))
+    return _brightened(by)._replace(sources=members[nearest].astype("<i4"), disks=disks)
+
+
+def _brightened(by: FloatArray) -> Fill:
+    """Gaussians brightened by factors ``[N]``, and nothing added."""
+    lit = np.flatnonzero(by > 1 + _LEAST_LIGHT)
+    return Fill(np.zeros(0, "<i4"), np.zeros((0, COLUMNS), "<f4"), lit.astype("<i4"), by[lit].astype("<f4"))
+
+
+def _without_shadow(gaussians: Gaussians, gone: Mask, kinds: IntArray, shadows: Shadows) -> Fill:
+    """What brightens surfaces once the shadow of things is gone."""
+    by, asked = np.ones(len(gone)), np.flatnonzero((kinds >= 0) & ~gone)
+    means = gaussians.means.detach().cpu().double().numpy()[asked]
+    by[asked] = shadows.factors(means, kinds[asked])
+    return _brightened(by)
 
 
 def _groups(kinds: IntArray) -> Mask:
@@ -266,31 +306,40 @@ def _groups(kinds: IntArray) -> Mask:
     return np.stack([*(kinds == number for number in range(kinds.max(initial=-1) + 1)), kinds == THING], 1)
 
 
-def _painted(photo: Orthophoto, hole: Mask, known: Mask, labels: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Colors of the pixels of a hole ``[F, 3]``, and the light that the surface lacks ``[P, P]``.
+def _painted(
+    place: _Place, hole: Mask, known: Mask, labels: IntArray, shadows: Shadows | None
+) -> tuple[FloatArray, FloatArray]:
+    """Colors of the pixels of a hole ``[F, 3]``, and the light that the surface seems to lack ``[P, P]``.
 
-    Each material continues itself.
+    Each material continues itself as it is without any shadow.
 
     Args:
-        photo: The surface from above.
+        place: The surface from above.
         hole: The pixels to paint ``[P, P]``.
         known: The pixels whose colors count ``[P, P]``.
         labels: The material of each pixel ``[P, P]``.
+        shadows: The shadows. The pattern tells the light of materials that show none.
     """
-    image, factors = photo.colors.clip(0, 1), np.ones(hole.shape)
+    photo, surface = place.photo, place.surface
+    image, factors, then = photo.colors.clip(0, 1), np.ones(hole.shape), np.ones(hole.shape)
+    if shadows is not None:
+        points = (surface.origin + photo.cells @ surface.axes[:2]).reshape(-1, 3)
+        now, then = (each.reshape(hole.shape) for each in shadows.at(points, labels.ravel()))
+        image = image / now[..., None]
     trust = known * (_UNSEEN + photo.shown)
     parts = []
     for part in (labels == label for label in np.unique(labels)):
         pure = binary_erosion(part, iterations=_MIXED, border_value=1)
         parts.append((part, trust * pure if (known & pure).sum() >= FEWEST else trust))
     for part, sources in parts:
-        factors[part] = light(photo.colors, hole, sources)[part]
+        if shadows is None or not shadows.light.direct[labels[part][0]]:
+            factors[part] = brightening(photo.colors, hole, sources)[part]
     image = image * factors[..., None]
     painted = image.copy()
     for part, sources in parts:
         if (hole & part).any():
             painted[hole & part] = completed(image, hole & part, sources)
-    return painted[hole], factors
+    return (painted * then[..., None])[hole], factors
 
 
 def _of_surface(low: Mask, counted: Mask, segments: Segments | None) -> Mask:

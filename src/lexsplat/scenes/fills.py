@@ -17,7 +17,8 @@ from lexsplat.geometry.gaussians import SH_C0, Gaussians
 MOST = 1 << 20
 """Most Gaussians of a fill."""
 _OPAQUE = 3.0
-_COLUMNS = 13
+COLUMNS = 13
+"""Numbers of a disk: see `Fill`."""
 _BRIGHTEST = 100.0
 
 
@@ -53,7 +54,7 @@ class Fill(NamedTuple):
             ValueError: If the data are not a fill.
         """
         try:
-            sources, disks = _unpacked(data["disks"], data["gaussians"], _COLUMNS)
+            sources, disks = _unpacked(data["disks"], data["gaussians"], COLUMNS)
             if "lit" not in data:
                 return cls(sources, disks)
             lit, factors = _unpacked(data["light"], data["lit"], 1)

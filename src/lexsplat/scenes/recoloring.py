@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 
 from lexsplat.geometry.gaussians import SH_C0, Gaussians
+from lexsplat.queries.colors import LUMINANCE
 
-_LUMINANCE = (0.2126, 0.7152, 0.0722)
 _BRIGHT = 0.9
 """Quantile of the shading from which on a recolored thing may turn pale."""
 
@@ -35,7 +35,7 @@ def recolored(gaussians: Gaussians, color: Sequence[float], strength: float) -> 
         return gaussians
     target = target.to(gaussians.sh0)
     old = gaussians.sh0[:, 0] * SH_C0 + 0.5
-    weights = torch.tensor(_LUMINANCE).to(old)
+    weights = torch.from_numpy(LUMINANCE).to(old)
     light = (old.clamp(0, 1) @ weights).clamp_min(0.02)
     shares = gaussians.opacities / gaussians.opacities.sum().clamp_min(1e-12)
     shading = light / (light * shares).sum()

@@ -85,7 +85,7 @@ def surface_below(
     """
     if len(own) < 4:
         return None
-    right, ahead = _across(up)
+    right, ahead = across(up)
     heights = own @ up
     low, high = np.quantile(heights, [0.02, 0.98])
     foot = own[heights <= low + _FOOT * (high - low)]
@@ -106,7 +106,7 @@ def surface_below(
     if plane is None:
         return None
     origin, normal = plane
-    axes = np.stack([*_across(normal), normal])
+    axes = np.stack([*across(normal), normal])
     middle = np.median((foot - origin) @ axes[:2].T, 0)
     return Surface(origin, axes, middle, radius, max(REACH * radius, TALL * (high - low) + radius))
 
@@ -128,7 +128,7 @@ def _fitted_plane(points: FloatArray, up: FloatArray, level: float) -> tuple[Flo
     return (origin, normal) if normal @ up >= _STEEPEST else None
 
 
-def _across(up: FloatArray) -> tuple[FloatArray, FloatArray]:
+def across(up: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two unit vectors that are square to ``up`` and to each other."""
     right = np.cross(up, np.eye(3)[int(np.abs(up).argmin())])
     right /= np.linalg.norm(right)
@@ -217,7 +217,8 @@ class Orthophoto(NamedTuple):
         cells: Places of the pixels in the two vectors of the plane ``[P, P, 2]``.
         size: Width of a pixel, world units.
         colors: RGB ``[P, P, 3]``, divided by the coverage.
-        shown: Share of the views that see the surface there ``[P, P]``.
+        coverage: How opaque the surface is there ``[P, P]``.
+        shown: Share of the views that see the surface there, or nothing in its place ``[P, P]``.
         covered: Share of the views that have the thing before it ``[P, P]``.
         revealed: Share of the views that have nothing but the thing before it ``[P, P]``.
     """
@@ -225,6 +226,7 @@ class Orthophoto(NamedTuple):
     cells: FloatArray
     size: float
     colors: FloatArray
+    coverage: FloatArray
     shown: FloatArray
     covered: FloatArray
     revealed: FloatArray
@@ -252,7 +254,7 @@ def photographed(views: Views, gone: Mask, surface: Surface, members: Mask) -> O
         there, drawn = (mean_around(image, known.astype(float), width, 4.0) for image in (seen, colors))
         gain = (there / np.maximum(drawn, 0.02)).clip(0.5, 2)
     shown = shown if views.of else np.ones_like(shown)
-    return Orthophoto(cells, size, colors * gain, shown, covered, revealed)
+    return Orthophoto(cells, size, colors * gain, coverage, shown, covered, revealed)
 
 
 def looked_up(
