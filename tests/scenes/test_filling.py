@@ -405,3 +405,19 @@ def test_what_a_deleted_thing_and_others_hid_together_is_filled_and_what_only_ot
     assert nearest[0] < 0.03
     assert nearest[1] > 0.08
     assert cKDTree(left).query(plate)[0].max() < 1e-6, "the plate is whole"
+
+
+def test_a_fill_ends_where_the_photos_show_that_the_table_ends():
+    """As below a plant that reaches over the edge of a table."""
+    scene, world = table_with_a_ball()
+    kept = ((scene.gaussians.means[:, 0] < 0.15) | (scene.field.codes[:, 0] == 1)).nonzero()[:, 0]
+    scene = Scene(scene.gaussians.select(kept), scene.field.select(kept), {}, "bundled")
+    angles = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    eyes = [np.array([2.5 * np.cos(angle), 2.5 * np.sin(angle), 1.2]) for angle in angles]
+    cameras = [look_at(eye, np.zeros(3), np.array([0, 0, 1.0]), 160, 120, 1.0) for eye in eyes]
+    fill, _ = fill_for(ball_of(scene, world), cameras)
+    assert (fill.disks[:, 0] > 0.25).mean() < 0.05
+    inside = np.hypot(fill.disks[:, 0], fill.disks[:, 1]) < 0.15
+    assert inside.sum() > 20, "the hole under the ball is filled"
+    unknown = fill_for(ball_of(scene, world))[0]
+    assert (unknown.disks[:, 0] > 0.25).mean() > 0.06, "nobody sees the end without photos"

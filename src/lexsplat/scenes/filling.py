@@ -75,7 +75,8 @@ _NEAR = 8
 _BARE = 0.6
 """Coverage below which a pixel is bare."""
 _VOID = (0.2, 0.5)
-"""A pixel that is covered less than this, though more than so many of the views see it, is beyond the surface's end."""
+"""A pixel that is covered less than the first, though more of the views than the second see it, is beyond the end of
+the surface."""
 _UNSEEN = 0.3
 """Trust in a pixel that no view sees. Another one gains the share of the views that see it."""
 _SIZES = (0.8, 0.8, 0.1)
@@ -242,7 +243,8 @@ def _hole(place: _Place, flat: Mask, revealed: Mask) -> tuple[Mask, Mask, FloatA
     filled = binary_dilation(place.unseen, iterations=_OVERLAP)
     around = near | place.unknown | binary_dilation(filled, iterations=_OVERLAP)
     hole = filled | (around & (coverage < _BARE))
-    hole &= ~((place.photo.coverage < _VOID[0]) & (place.photo.shown > _VOID[1]))
+    if place.views.of:
+        hole &= ~((place.photo.coverage < _VOID[0]) & (place.photo.shown > _VOID[1]))
     level = np.abs(heights) <= THICK * radius
     known = (coverage >= _BARE) & level & ~binary_dilation(hole, iterations=_RIM)
     return hole, known, heights

@@ -271,7 +271,8 @@ def _bright_places(
         [_thinned(asked[kinds[asked] == each], _PLACES) for each in range(kinds.max() + 1)]
     )
     seen, _, _, colors = looked_up(views, np.zeros(len(means), bool), means[asked], _SLACK * size)
-    asked, seen, bright = asked[seen > 0], seen[seen > 0], colors[seen > 0] @ LUMINANCE
+    clear = colors.any(1)
+    asked, seen, bright = asked[clear], seen[clear], colors[clear] @ LUMINANCE
     at, of = means[asked], kinds[asked]
     cubes = np.column_stack([np.floor(at / (_TOGETHER * size)).astype(int), of])
     groups = np.unique(cubes, axis=0, return_inverse=True)[1].ravel()

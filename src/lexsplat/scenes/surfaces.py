@@ -247,7 +247,7 @@ def photographed(views: Views, gone: Mask, surface: Surface, members: Mask) -> O
     *shares, seen = looked_up(views, gone, places, THICK * surface.radius)
     shown, covered, revealed = (share.reshape(cells.shape[:2]) for share in shares)
     seen = seen.reshape(colors.shape)
-    known = (coverage > 0.5) & (shown > 0)
+    known = (coverage > 0.5) & seen.any(-1)
     width = surface.radius / size / 2
     gain = np.ones(3)
     if known.any():
@@ -269,10 +269,11 @@ def looked_up(
         slack: Depth tolerance, world units: a surface up to this far before a place is taken for it.
 
     Returns:
-        The share of the views that see each place ``[M]``, the share that have the thing there or before it ``[M]``,
-        the share that have nothing else before it ``[M]``, and the mean color of the first ``[M, 3]``, 0 without any.
+        The share of the views that see each place, or through it ``[M]``, the share that have the thing there or
+        before it ``[M]``, the share that have nothing else before it ``[M]``, and the mean color of the first
+        ``[M, 3]``, 0 without any.
     """
-    counts, shown, covered, revealed = (np.zeros(len(places)) for _ in range(4))
+    counts, shown, covered, revealed, colored = (np.zeros(len(places)) for _ in range(5))
     colors = np.zeros((len(places), 3))
     thing = torch.from_numpy(gone)[:, None].to(views.gaussians.means)
     for number, camera in enumerate(views.small):
@@ -282,9 +283,10 @@ def looked_up(
         with torch.no_grad():
             looked = views.at(number, asked)
             view = render(views.gaussians, camera, features=thing, depth=True, prepared=looked)
-        nearest = cast(torch.Tensor, view.depth).cpu().numpy()
         pixels = tuple(found[here, ::-1].astype(int).T)
-        there = nearest[pixels] > depth[here] - slack
+        empty = view.alpha.cpu().numpy().reshape(camera.height, camera.width)[pixels] < _EMPTY
+        nearest = np.where(empty, np.inf, cast(torch.Tensor, view.depth).cpu().numpy()[pixels])
+        there = nearest > depth[here] - slack
         before = view.features[..., 0].cpu().numpy()[pixels] > _BEFORE
         counts[here] += 1
         covered[here] += before
@@ -292,8 +294,10 @@ def looked_up(
         if before.any():
             left = views.depth_without(number, gone, asked[before])[tuple(asked[before, ::-1].T)]
             revealed[here[before]] += left > depth[here[before]] - slack
-        colors[here] += (there & ~before)[:, None] * view.image.cpu().double().numpy()[pixels]
-    colors /= np.maximum(shown, 1)[:, None]
+        clear = there & ~before & ~empty
+        colored[here] += clear
+        colors[here] += clear[:, None] * view.image.cpu().double().numpy()[pixels]
+    colors /= np.maximum(colored, 1)[:, None]
     counts = np.maximum(counts, 1)
     return shown / counts, covered / counts, revealed / counts, colors
 
