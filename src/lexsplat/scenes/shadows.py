@@ -43,13 +43,13 @@ _PLACES, _THINGS = 4000, 20000
 """Most places of a surface, and most Gaussians of things, from which the light is found."""
 _PIXEL = 0.065
 """Width of the pixels of a shadow, in sizes of a thing."""
-_RAYS = 16
+_RAYS = 12
 """Rays from a place to the lamp."""
 _DIRECTIONS, _TANGENTS = 24, (0.4, 0.8, 1.3, 2.0)
 """Directions that are tried: how many around, and tangents of their angles with up."""
 _TURNS, _STRETCHES = (-10.0, -5.0, 0.0, 5.0, 10.0), (0.7, 0.85, 1.0, 1.2, 1.4)
 """Finer steps around the best of them, in degrees around, and as factors of the tangent."""
-_WIDTHS, _NEARNESS = (0.1, 0.2, 0.3), (0.0, 0.05, 0.1)
+_WIDTHS, _NEARNESS = (0.03, 0.1, 0.2, 0.3), (0.0, 0.05, 0.1)
 """Half widths of the lamp in radians, and inverse distances, in sizes of a thing, that are tried."""
 _SHARES = np.linspace(0, 0.7, 15)
 """Shares of a surface's brightness that may come from the lamp."""
@@ -101,22 +101,25 @@ class Light(NamedTuple):
         if not len(things) or not len(places):
             return np.zeros(len(places), bool)
         pixel = _PIXEL * self.size
-        (above, high), (below, low) = (self._seen(each, ray) for each in (things, places))
-        start = above.min(0) - 2 * pixel
-        count = np.floor((above.max(0) - start) / pixel).astype(int) + 3
-        nearest = np.full(count, -np.inf)
-        np.maximum.at(nearest, tuple(((above - start) / pixel).astype(int).T), high)
+        (right, ahead, high), (column, row, low) = (
+            self._seen(each, ray) / pixel for each in (things, places)
+        )
+        left, bottom = right.min() - 2, ahead.min() - 2
+        width, height = int(right.max() - left) + 3, int(ahead.max() - bottom) + 3
+        nearest = np.full((width, height), -np.inf)
+        np.maximum.at(nearest, ((right - left).astype(int), (ahead - bottom).astype(int)), high)
         nearest = minimum_filter(maximum_filter(nearest, 3), 3)  # Gaussians are further apart than pixels
-        column, row = np.floor((below - start) / pixel).astype(int).T
-        inside = (column >= 0) & (column < count[0]) & (row >= 0) & (row < count[1])
-        column, row = column.clip(0, count[0] - 1), row.clip(0, count[1] - 1)
-        return inside & (nearest[column, row] > low + pixel)
+        column, row = (
+            (column - left).clip(0, width - 1),
+            (row - bottom).clip(0, height - 1),
+        )  # the rim is empty
+        return nearest[column.astype(int), row.astype(int)] > low + 1
 
-    def _seen(self, points: FloatArray, ray: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where points are from a point of the lamp: in an image ``[P, 2]``, and toward it ``[P]``."""
-        away = points - self.center
-        toward = away @ ray
-        return away @ np.stack(across(ray), 1) / (1 - toward * self.nearness).clip(0.05)[:, None], toward
+    def _seen(self, points: FloatArray, ray: FloatArray) -> FloatArray:
+        """Where points are from a point of the lamp: two coordinates in an image, and how near to it ``[3, P]``."""
+        right, ahead, toward = np.stack([*across(ray), ray]) @ (points - self.center).T
+        scale = (1 - toward * self.nearness).clip(0.05)
+        return np.stack([right / scale, ahead / scale, toward])
 
 
 class Shadows(NamedTuple):
@@ -204,7 +207,7 @@ def _best_light(explained: Callable[..., float]) -> tuple[float, ...] | None:
     def best_of(candidates: Iterable[tuple[float, ...]]) -> tuple[float, ...]:
         return max(candidates, key=lambda numbers: explained(*numbers))
 
-    finer = ((angle + turn, tangent * by, _WIDTHS[1]) for turn in _TURNS for by in _STRETCHES)
+    finer = ((angle + turn, tangent * by, _WIDTHS[2]) for turn in _TURNS for by in _STRETCHES)
     angle, tangent, _ = best_of(finer)
     found = best_of((angle, tangent, width) for width in _WIDTHS)
     return best_of((*found, nearness) for nearness in _NEARNESS)
