@@ -122,8 +122,8 @@ def _apart(gaussians: Gaussians, members: IntArray, others: IntArray) -> tuple[I
     way = means[near] - means[members][:, None]
     distances = np.linalg.norm(way, axis=2)
     way = way / np.maximum(distances, 1e-12)[..., None]
-    own = np.broadcast_to(members[:, None], near.shape)
-    reach = _deviations(gaussians, own, way) + _deviations(gaussians, near, way)
+    both = np.stack([np.broadcast_to(members[:, None], near.shape), near])
+    reach = _deviations(gaussians, both, np.stack([way, way])).sum(0)
     apart = distances / np.maximum(reach, 1e-12)
     best = apart.argmin(1)[:, None]
     return np.take_along_axis(near, best, 1)[:, 0], np.take_along_axis(apart, best, 1)[:, 0]

@@ -79,8 +79,10 @@ def _pieces(points: FloatArray, firm: NDArray[np.bool_]) -> IntArray:
     """The thing that each point ``[M, 3]`` of a cluster belongs to ``[M]``: 0 for all if it is one; z is up."""
     seen = points[firm]
     sample = seen[:: -(-len(seen) // _SAMPLE)]
-    for count in range(min(_MOST, len(seen) // _FEWEST), 1, -1):
-        centers, labels = _side_by_side(sample[:, :2], count)
+    most = min(_MOST, len(seen) // _FEWEST)
+    starts = _far_apart(sample[:, :2], most)
+    for count in range(most, 1, -1):
+        centers, labels = _side_by_side(sample[:, :2], starts[:count])
         parts = [sample[labels == piece] for piece in range(count)]
         if min(map(len, parts)) * len(seen) < _FEWEST * len(sample) or _is_ring(sample[:, :2], centers):
             continue
@@ -90,14 +92,20 @@ def _pieces(points: FloatArray, firm: NDArray[np.bool_]) -> IntArray:
     return np.zeros(len(points), np.intp)
 
 
-def _side_by_side(plan: FloatArray, count: int) -> tuple[FloatArray, IntArray]:
-    """Centers ``[K, 2]`` and labels ``[M]`` of pieces, by k-means from points far distances."""
+def _far_apart(plan: FloatArray, count: int) -> FloatArray:
+    """Points ``[K, 2]``, each the farthest from those before it."""
     distances = ((plan - plan.mean(0)) ** 2).sum(1)
     centers = plan[distances.argmax()][None]
     distances = np.full(len(plan), np.inf)
     while len(centers) < count:
         distances = np.minimum(distances, ((plan - centers[-1]) ** 2).sum(1))
         centers = np.concatenate([centers, plan[distances.argmax()][None]])
+    return centers
+
+
+def _side_by_side(plan: FloatArray, centers: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Centers ``[K, 2]`` and labels ``[M]`` of pieces, by k-means from some centers."""
+    count = len(centers)
     for _ in range(_ROUNDS):
         labels = _nearest(plan, centers)
         sizes = np.maximum(np.bincount(labels, minlength=count), 1)

@@ -43,6 +43,8 @@ _PLACES, _THINGS = 4000, 20000
 """Most places of a surface, and most Gaussians of things, from which the light is found."""
 _PIXEL = 0.065
 """Width of the pixels of a shadow, in sizes of a thing."""
+_FAR = 1024
+"""Things further than this many pixels from the center throw no shadow: a speck far away would make a huge image."""
 _RAYS = 12
 """Rays from a place to the lamp."""
 _DIRECTIONS, _TANGENTS = 24, (0.4, 0.8, 1.3, 2.0)
@@ -98,22 +100,19 @@ class Light(NamedTuple):
 
     def _hidden(self, things: FloatArray, places: FloatArray, ray: FloatArray) -> Mask:
         """The places ``[M]`` that things hide from a point of the lamp, by an image of the things' nearness to it."""
-        if not len(things) or not len(places):
-            return np.zeros(len(places), bool)
-        pixel = _PIXEL * self.size
-        (right, ahead, high), (column, row, low) = (
-            self._seen(each, ray) / pixel for each in (things, places)
+        above, (column, row, low) = (
+            self._seen(each, ray) / (_PIXEL * self.size) for each in (things, places)
         )
+        right, ahead, high = above[:, (np.abs(above[:2]) < _FAR).all(0)]
+        if not len(high):
+            return np.zeros(len(places), bool)
         left, bottom = right.min() - 2, ahead.min() - 2
         width, height = int(right.max() - left) + 3, int(ahead.max() - bottom) + 3
         nearest = np.full((width, height), -np.inf)
         np.maximum.at(nearest, ((right - left).astype(int), (ahead - bottom).astype(int)), high)
         nearest = minimum_filter(maximum_filter(nearest, 3), 3)  # Gaussians are further apart than pixels
-        column, row = (
-            (column - left).clip(0, width - 1),
-            (row - bottom).clip(0, height - 1),
-        )  # the rim is empty
-        return nearest[column.astype(int), row.astype(int)] > low + 1
+        column, row = (column - left).clip(0, width - 1), (row - bottom).clip(0, height - 1)
+        return nearest[column.astype(int), row.astype(int)] > low + 1  # the rim of the image is empty
 
     def _seen(self, points: FloatArray, ray: FloatArray) -> FloatArray:
         """Where points are from a point of the lamp: two coordinates in an image, and how near to it ``[3, P]``."""
