@@ -13,7 +13,7 @@ from lexsplat.geometry.world import World
 from lexsplat.queries.selection import Selection
 from lexsplat.scenes.filling import fill_for
 from lexsplat.scenes.materials import THING, UNLISTED
-from lexsplat.scenes.shadows import Light, Shadows, find_light
+from lexsplat.scenes.shadows import Light, Shadows, find_light, shadows_of
 from lexsplat.scenes.surfaces import Views
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -142,7 +142,7 @@ def test_a_deleted_thing_takes_its_shadow_along_from_the_wall_and_leaves_those_o
     gaussians, of, hidden, parts, light = lit_room
     mask = torch.from_numpy(parts == 3)
     chosen = Selection(gaussians, {}, mask, mask.float(), phrase="box", world=World(Up(UP, True)))
-    fill, _ = fill_for(chosen, cameras(), kinds=of, light=light)
+    fill, _ = fill_for(chosen, cameras(), kinds=of, shadows=shadows_of(light, gaussians, chosen, of))
     after = fill.relit(gaussians).sh0[:, 0, 0].double().numpy() * SH_C0 + 0.5
     wall, alone = of == 1, hidden[1] & ~hidden[0]
     assert (wall & alone).sum() > 30

@@ -21,18 +21,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lexsplat.geometry.cameras import Camera
 from lexsplat.geometry.gaussians import Gaussians
 from lexsplat.language.fields import LanguageField
 from lexsplat.language.segments import Segments
 from lexsplat.queries.selection import Selection
 from lexsplat.queries.visibility import whole_things, with_remains
-from lexsplat.queries.vocabulary import is_divided
 from lexsplat.runtime.errors import FileFormatError, LexsplatError, QueryError, SceneFolderError
 from lexsplat.runtime.files import atomic_path
 from lexsplat.runtime.fingerprints import fingerprint
-from lexsplat.runtime.progress import Event
-from lexsplat.runtime.sampling import evenly
 from lexsplat.scenes.colors import parse_color
 from lexsplat.scenes.filling import fill_for
 from lexsplat.scenes.fills import Fill
@@ -41,20 +37,18 @@ from lexsplat.scenes.formats.language import write_field
 from lexsplat.scenes.gone import gone_nouns
 from lexsplat.scenes.journal import CHANGES, Journal, Kind, Step, packed, unpacked
 from lexsplat.scenes.kept import keep_for
-from lexsplat.scenes.materials import THING, UNLISTED, kinds_of_segments
+from lexsplat.scenes.materials import UNLISTED, kinds_of_segments
 from lexsplat.scenes.recoloring import recolored
 from lexsplat.scenes.scene import Scene
-from lexsplat.scenes.shadows import Light, find_light
-from lexsplat.scenes.surfaces import Views
+from lexsplat.scenes.shadows import Light, light_of, shadows_of
 from lexsplat.scenes.transforms import Motion, transformed
+from lexsplat.scenes.views import training_cameras
 
 _STILL = Motion()
 MAX_GROWTH = 16
 """Largest number of Gaussians after edits, as a multiple of the original: copies of copies would fill the memory."""
 FEWEST = 2
 """Smallest number of Gaussians after an edit; pages draw no fewer."""
-_VIEWS_OF_LIGHT = 8
-"""Views that show how bright surfaces are."""
 
 
 def apply(step: Step, gaussians: Gaussians, language: LanguageField) -> tuple[Gaussians, LanguageField]:
@@ -132,11 +126,6 @@ def _with_segments(language: LanguageField, segments: Segments | None) -> Langua
     return changed
 
 
-def _training(scene: Scene) -> list[Camera]:
-    """The views that a scene was made from."""
-    return [view.camera for view in scene.views.values() if view.split == "train"]
-
-
 class Editor:
     """A scene under edit.
 
@@ -203,7 +192,8 @@ class Editor:
 
         Args:
             chosen: The selection.
-            fill: Close the surface under its things, which no photo shows (`lexsplat.scenes.filling`).
+            fill: Close the surface under its things, which no photo shows, and take their shadows off the surfaces
+                around (`lexsplat.scenes.filling`).
         """
         self._do("delete", chosen, fill)
 
@@ -343,17 +333,13 @@ class Editor:
         gone = self.planned_mask("delete", chosen) if kind in ("delete", "move") else mask
         if fill:
             things = replace(chosen, mask=gone, parts=())
-            scene, listener = self.scene, self.original.listener
-            listener(Event("fill", 0, len(things.instances)))
-            found, gone = fill_for(
-                things,
-                _training(self.original),
-                listener,
-                scene.hidden,
-                scene.field.segments,
-                self._kinds(),
-                self._light,
-            )
+            scene, before, kinds = self.scene, self.original, self._kinds()
+            shadows = None
+            if self._light is not None and kinds is not None:
+                shadows = shadows_of(self._light, before.gaussians, things, kinds)
+            cameras = training_cameras(before.views)
+            segments = scene.field.segments
+            found, gone = fill_for(things, cameras, before.listener, scene.hidden, segments, kinds, shadows)
             if found is not None:
                 values["fill"] = found.to_json()
         if kind == "move":
@@ -397,18 +383,10 @@ class Editor:
     @cached_property
     def _light(self) -> Light | None:
         """The light of the original; None without a list, or if its shadows do not tell."""
-        scene = self.original
-        if self._listed is None or scene.field.segments is None:
+        segments = self.original.field.segments
+        if self._listed is None or segments is None:
             return None
-        things = [each for each in scene.objects if not is_divided(each.phrase)]
-        if not things:
-            return None
-        kinds = self._listed[scene.field.segments.labels.cpu().numpy()]
-        standing = torch.from_numpy(kinds == THING) & ~scene.hidden.cpu()
-        means = scene.gaussians.means.detach().cpu()[standing].double().numpy()
-        views = Views(scene.gaussians, evenly(_training(scene), _VIEWS_OF_LIGHT))
-        size = float(np.median([np.median(each.size) for each in things]))
-        return find_light(views, kinds, means, things[0].up.direction, size)
+        return light_of(self.original, self._listed[segments.labels.cpu().numpy()])
 
     @contextmanager
     def _change(self, entry: dict[str, Any]) -> Iterator[None]:

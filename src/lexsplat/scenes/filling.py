@@ -38,7 +38,7 @@ from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.completing import brightening, completed
 from lexsplat.scenes.fills import COLUMNS, MOST, Fill
 from lexsplat.scenes.materials import THING, UNLISTED, materials
-from lexsplat.scenes.shadows import Light, Shadows
+from lexsplat.scenes.shadows import Shadows
 from lexsplat.scenes.surfaces import (
     FEWEST,
     REACH,
@@ -102,7 +102,7 @@ def fill_for(
     hidden: Tensor | None = None,
     segments: Segments | None = None,
     kinds: IntArray | None = None,
-    light: Light | None = None,
+    shadows: Shadows | None = None,
 ) -> tuple[Fill | None, Tensor]:
     """What closes the surfaces under a deleted selection, and the Gaussians that are deleted with it.
 
@@ -114,15 +114,15 @@ def fill_for(
         segments: The segments of the scene: the fill takes no language from things that stand on the surface.
         kinds: What each Gaussian is of ``[N]``, as `lexsplat.scenes.materials.kinds_of_segments` says: surfaces meet
             under a thing. None takes all for one surface.
-        light: The light of the scene; None guesses shadows from the pattern around a thing.
+        shadows: The shadows of the selection and of what stays; None guesses them from the pattern around a thing.
 
     Returns:
-        The fill, None if there is nothing to fill, and the selection with the remains under its things ``[N]`` bool.
+        The fill, which may only brighten, or None if there is nothing to do; and the selection with the remains under
+        its things ``[N]`` bool.
     """
     gone = chosen.mask.cpu().numpy().copy()
     shown = np.zeros_like(gone) if hidden is None else ~hidden.cpu().numpy()
     kinds = np.full(len(gone), UNLISTED) if kinds is None else kinds
-    shadows = None if light is None else _shadows(light, chosen, kinds)
     scene = _Scene(Views(chosen.gaussians, cameras), shown, segments, kinds, shadows)
     things, found = chosen.instances, list[Fill]()
     try:
@@ -137,7 +137,11 @@ def fill_for(
     mask = torch.from_numpy(gone).to(chosen.mask.device)
     if not any(len(fill.disks) + len(fill.lit) for fill in found):
         return None, mask
-    return Fill(*(np.concatenate(rows)[:MOST] for rows in zip(*found))), mask
+    sources, disks, *_ = (np.concatenate(rows)[:MOST] for rows in zip(*found))
+    by = np.ones(len(gone))
+    for fill in found:
+        by[fill.lit] = np.maximum(by[fill.lit], fill.factors)
+    return _brightened(by)._replace(sources=sources, disks=disks), mask
 
 
 class _Scene(NamedTuple):
@@ -156,13 +160,6 @@ class _Scene(NamedTuple):
     segments: Segments | None
     kinds: IntArray
     shadows: Shadows | None
-
-
-def _shadows(light: Light, chosen: Selection, kinds: IntArray) -> Shadows:
-    means = chosen.gaussians.means.detach().cpu().double().numpy()
-    solid = chosen.gaussians.opacities.detach().cpu().numpy() >= _FAINT
-    own = chosen.mask.cpu().numpy()
-    return Shadows(light, means[own & solid], means[~own & solid & (kinds == THING)])
 
 
 class _Place(NamedTuple):
@@ -217,9 +214,9 @@ def _remains(place: _Place, gone: Mask, shown: Mask) -> tuple[Mask, Mask]:
     Those that are shown and stand on the thing are no remains: things on a cloth, on a table.
     """
     local, body, radius = place.local, place.body, place.surface.radius
-    inside = _at(place.unseen, local[:, :2], place.photo) & place.level
+    inside = place.photo.at(place.unseen, local[:, :2]) & place.level
     inside &= ~_standing(local, body, inside & shown)
-    inside |= _at(place.unknown, local[:, :2], place.photo) & place.level & ~shown
+    inside |= place.photo.at(place.unknown, local[:, :2]) & place.level & ~shown
     stuffing = _stuffing(place.views, place.own, gone | inside)
     inside |= stuffing & ~_standing(local, body, stuffing & shown)
     revealed = _revealed(place.views, place.own, gone) & (local[:, 2] >= -THICK * radius)
@@ -265,7 +262,8 @@ def _fill_below(thing: Selection, gone: Mask, scene: _Scene) -> Fill | None:
     labels, others = materials(covered, known)
     if (known & ~others).sum() >= FEWEST:  # what stands on the surface is none of its pattern
         known &= ~others
-    painted, factors = _painted(place, hole, known, labels, scene.shadows)
+    listed = _are_listed(labels, covered, known)
+    painted, factors = _painted(place, hole, known, np.where(listed, labels, UNLISTED), scene.shadows)
     near = np.linalg.norm(local[:, :2] - surface.foot, axis=1) <= REACH * surface.radius
     # nobody knows what hidden Gaussians are
     counted = place.solid & near & ~gone & (scene.shown | ~scene.shown.any())
@@ -275,7 +273,7 @@ def _fill_below(thing: Selection, gone: Mask, scene: _Scene) -> Fill | None:
     if not len(members):
         members = np.flatnonzero(flat & ~inside)
     gone |= inside
-    by = np.where(flat & surfaces & ~gone, _at(factors, local[:, :2], photo), 1.0)
+    by = np.where(flat & surfaces & ~gone, photo.at(factors, local[:, :2]), 1.0)
     waves = known & (np.abs(heights) <= _WAVES * surface.radius)
     raised = _continued(heights, hole, waves if waves.sum() >= FEWEST else known)
     places = np.concatenate([photo.cells[hole], raised[:, None]], 1)
@@ -292,6 +290,7 @@ def _fill_below(thing: Selection, gone: Mask, scene: _Scene) -> Fill | None:
 def _brightened(by: FloatArray) -> Fill:
     """Gaussians brightened by factors ``[N]``, and nothing added."""
     lit = np.flatnonzero(by > 1 + _LEAST_LIGHT)
+    lit = np.sort(lit[np.argsort(-by[lit], kind="stable")[:MOST]])
     return Fill(np.zeros(0, "<i4"), np.zeros((0, COLUMNS), "<f4"), lit.astype("<i4"), by[lit].astype("<f4"))
 
 
@@ -301,6 +300,23 @@ def _without_shadow(gaussians: Gaussians, gone: Mask, kinds: IntArray, shadows: 
     means = gaussians.means.detach().cpu().double().numpy()[asked]
     by[asked] = shadows.factors(means, kinds[asked])
     return _brightened(by)
+
+
+def _are_listed(labels: IntArray, covered: FloatArray, known: Mask) -> Mask:
+    """The pixels ``[P, P]`` of materials that are listed surfaces for the most part.
+
+    Args:
+        labels: The material of each pixel ``[P, P]``.
+        covered: How much of each pixel the Gaussians of each surface cover, and those of things ``[P, P, G + 1]``.
+        known: The pixels that count ``[P, P]``.
+    """
+    found = np.zeros(labels.shape, bool)
+    for label in np.unique(labels):
+        part = known & (labels == label)
+        found[labels == label] = (
+            part.any() and label < covered.shape[-1] - 1 and covered[part][:, label].mean() > 0.5
+        )
+    return found
 
 
 def _groups(kinds: IntArray) -> Mask:
@@ -320,10 +336,10 @@ def _painted(
         hole: The pixels to paint ``[P, P]``.
         known: The pixels whose colors count ``[P, P]``.
         labels: The material of each pixel ``[P, P]``.
-        shadows: The shadows. The pattern tells the light of materials that show none.
+        shadows: The shadows. The pattern tells the light of what is no listed surface, or has no direct light.
     """
     photo, surface = place.photo, place.surface
-    image, factors, then = photo.colors.clip(0, 1), np.ones(hole.shape), np.ones(hole.shape)
+    image, (factors, now, then) = photo.colors.clip(0, 1), np.ones((3, *hole.shape))
     if shadows is not None:
         points = (surface.origin + photo.cells @ surface.axes[:2]).reshape(-1, 3)
         now, then = (each.reshape(hole.shape) for each in shadows.at(points, labels.ravel()))
@@ -334,9 +350,11 @@ def _painted(
         pure = binary_erosion(part, iterations=_MIXED, border_value=1)
         parts.append((part, trust * pure if (known & pure).sum() >= FEWEST else trust))
     for part, sources in parts:
-        if shadows is None or not shadows.light.direct[labels[part][0]]:
-            factors[part] = brightening(photo.colors, hole, sources)[part]
-    image = image * factors[..., None]
+        if shadows is not None and labels[part][0] >= 0 and shadows.light.direct[labels[part][0]]:
+            factors[part] = (then / now)[part]
+        else:
+            lighter = brightening(photo.colors, hole, sources)[part]
+            factors[part], image[part] = lighter, image[part] * lighter[:, None]
     painted = image.copy()
     for part, sources in parts:
         if (hole & part).any():
@@ -409,15 +427,6 @@ def _revealed(views: Views, own: Mask, gone: Mask) -> Mask:
         now, then = views.weights(places, gone)
         found[places] = then > _REVEALED * now
     return found
-
-
-def _at(image: NDArray, points: FloatArray, photo: Orthophoto) -> NDArray:
-    """The pixels ``[N]`` of an image ``[P, P]`` in which points ``[N, 2]`` of the plane lie; 0 outside."""
-    (first, *_), count = photo.cells[0], len(image)
-    columns = np.round((points[:, 0] - first[0]) / photo.size).astype(int)
-    rows = np.round((first[1] - points[:, 1]) / photo.size).astype(int)
-    inside = (columns >= 0) & (columns < count) & (rows >= 0) & (rows < count)
-    return image[rows.clip(0, count - 1), columns.clip(0, count - 1)] * inside
 
 
 def _continued(heights: FloatArray, hole: Mask, known: Mask) -> FloatArray:

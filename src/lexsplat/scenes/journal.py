@@ -60,7 +60,7 @@ class Step:
 
     def __str__(self) -> str:
         fill = self.values.get("fill")
-        filled = f", filled with {fill['gaussians']}" if fill else ""
+        filled = f", filled with {fill['gaussians']}" if fill and fill["gaussians"] else ""
         return f"{self.kind} {self.phrase or 'a selection'} ({int(self.mask.sum())} Gaussians{filled})"
 
     def to_json(self) -> dict[str, Any]:

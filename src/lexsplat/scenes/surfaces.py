@@ -2,8 +2,8 @@
 
 1. A plane is fitted to the Gaussians around the thing's foot.
 2. The Gaussians near it are drawn from far above, in the mean color that the cameras see.
-3. Each pixel of this image is looked up in the views: how many see the surface there, and how many the thing before
-   it.
+3. Each pixel of this image is looked up in the views: how many see the surface there, or through it, and how many the
+   thing before it.
 """
 
 from __future__ import annotations
@@ -231,6 +231,14 @@ class Orthophoto(NamedTuple):
     covered: FloatArray
     revealed: FloatArray
 
+    def at(self, image: NDArray, points: FloatArray) -> NDArray:
+        """The pixels ``[N]`` of an image ``[P, P]`` in which points ``[N, 2]`` of the plane lie; 0 outside."""
+        (first, *_), count = self.cells[0], len(image)
+        columns = np.round((points[:, 0] - first[0]) / self.size).astype(int)
+        rows = np.round((first[1] - points[:, 1]) / self.size).astype(int)
+        inside = (columns >= 0) & (columns < count) & (rows >= 0) & (rows < count)
+        return image[rows.clip(0, count - 1), columns.clip(0, count - 1)] * inside
+
 
 def photographed(views: Views, gone: Mask, surface: Surface, members: Mask) -> Orthophoto:
     """An image of the surface under a thing from above, and what the views see of it.
@@ -270,8 +278,8 @@ def looked_up(
 
     Returns:
         The share of the views that see each place, or through it ``[M]``, the share that have the thing there or
-        before it ``[M]``, the share that have nothing else before it ``[M]``, and the mean color of the first
-        ``[M, 3]``, 0 without any.
+        before it ``[M]``, the share that have nothing else before it ``[M]``, and the mean color in those
+        of the first that see something ``[M, 3]``, 0 without any.
     """
     counts, shown, covered, revealed, colored = (np.zeros(len(places)) for _ in range(5))
     colors = np.zeros((len(places), 3))

@@ -158,3 +158,8 @@ def _stored_photo(entry: Any) -> PhotoLens | None:
     if not isinstance(model, str) or not sides or not np.isfinite(params).all():
         raise ValueError(f"photo {entry!r}"[:100])
     return PhotoLens(model, width, height, params)
+
+
+def training_cameras(views: Mapping[str, StoredView]) -> list[Camera]:
+    """The cameras of the views that a scene was made from."""
+    return [view.camera for view in views.values() if view.split == "train"]
