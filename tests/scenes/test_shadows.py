@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+import lexsplat
 from lexsplat.geometry.boxes import Up
 from lexsplat.geometry.cameras import look_at
 from lexsplat.geometry.gaussians import SH_C0, gaussians_from_points
 from lexsplat.geometry.world import World
 from lexsplat.queries.selection import Selection
+from lexsplat.scenes import shadows
+from lexsplat.scenes.editing import Editor, Motion
 from lexsplat.scenes.filling import fill_for
 from lexsplat.scenes.materials import THING, UNLISTED
 from lexsplat.scenes.shadows import Light, Shadows, find_light, shadows_of
@@ -156,3 +159,93 @@ def test_a_deleted_thing_takes_its_shadow_along_from_the_wall_and_leaves_those_o
     assert np.median(fill.disks[shaded, -1]) == pytest.approx(0.6, abs=0.06), (
         "nothing throws a shadow there now"
     )
+
+
+def test_a_black_surface_and_a_few_places_tell_nothing_of_the_light():
+    gaussians, of, *_ = room()
+    things = gaussians.means.double().numpy()[of == THING]
+    rug = (of == 0) & (gaussians.means.numpy()[:, 1] < -0.6)
+    gaussians.sh0[torch.from_numpy(rug)] = (0.02 - 0.5) / SH_C0
+    light = find_light(Views(gaussians, cameras()), np.where(rug, 2, of), things, UP, 0.4)
+    assert np.degrees(np.arccos(light.toward @ SUN)) < 8
+    for seed in range(4):
+        noisy, of, *_ = room(share=0.0)
+        noisy.sh0 += 0.12 * torch.from_numpy(np.random.default_rng(seed).normal(size=(len(of), 1, 3))).float()
+        few = np.random.default_rng(seed).permutation(np.flatnonzero(of == 0))[:60]
+        kinds = np.where(np.isin(np.arange(len(of)), few) | (of == THING), of, UNLISTED)
+        assert find_light(Views(noisy, cameras()), kinds, things, UP, 0.4) is None
+
+
+def test_a_speck_far_away_and_what_is_beyond_a_near_lamp_throw_no_shadow():
+    box, side = surface_of(LOW[0], HIGH[0], 0.02), np.linspace(-1, 1, 40)
+    places = np.pad(np.stack(np.meshgrid(side, side), -1).reshape(-1, 2), ((0, 0), (0, 1)))
+    sun = Light(UP, np.zeros(3), 0.0, 0.0, np.zeros(1), 0.4)
+    speck = np.concatenate([box, [[1e6, -1e6, 3.0]]])
+    np.testing.assert_array_equal(sun.hidden(speck, places), sun.hidden(box, places))
+    assert sun.hidden(box, places).any()
+    lamp = sun._replace(nearness=0.5)  # 2 above the floor
+    assert lamp.hidden(box, places).any()
+    assert not lamp.hidden(box + 5 * UP, places).any()
+    assert not lamp.hidden(box, places + 6 * UP).any()
+    far = np.array([3e3, 3e3, 0])
+    apart = sun.hidden(np.concatenate([box, box + far]), np.concatenate([places, places + far]))
+    assert apart[:, : len(places)].any(), (
+        "an image of them all is coarse: at full size it has 10 billion pixels"
+    )
+
+
+def test_the_floor_below_a_table_gets_no_light_when_a_thing_on_the_table_goes():
+    light = Light(UP, np.zeros(3), 0.0, 0.0, np.array([0.5, 0.5]), 0.4)
+    table = surface_of(np.array([-1, -1, 0.95]), np.array([1, 1, 1.0]), 0.02)
+    box = surface_of(LOW[0], HIGH[0], 0.02) + UP
+    places = np.array([[-0.55, -0.05, 1.0], [-0.55, -0.05, 0.0]])
+    alone, below = (
+        Shadows(light, box, box[:0], surfaces, np.zeros(len(surfaces), int))
+        for surfaces in (table[:0], table)
+    )
+    assert alone.factors(places, np.array([0, 1])) == pytest.approx([2, 2])
+    assert below.factors(places, np.array([0, 1])) == pytest.approx([2, 1])
+
+
+def test_what_edits_copied_or_moved_threw_no_shadow_where_it_is_now(lit_room):
+    gaussians, of, _, parts, light = lit_room
+    box = torch.from_numpy(parts == 3)
+    moved = gaussians.map(torch.clone)
+    moved.means[box] += torch.tensor([0.0, 0.0, 1.0])
+    chosen = Selection(moved, {}, box, box.float(), phrase="box", world=World(Up(UP, True)))
+    found = shadows_of(light, gaussians, chosen, of)
+    assert len(found.gone) == 0
+    assert len(found.others) == (parts == 2).sum()
+    assert (found.factors(moved.means.double().numpy(), of) == 1).all()
+    back = shadows_of(light, gaussians, Selection(gaussians, {}, box, box.float()), of)
+    assert len(back.gone) == (parts == 3).sum()
+
+
+@pytest.mark.slow
+def test_an_editor_finds_the_light_of_its_scene_and_a_copy_takes_no_shadow_along():
+    scene = lexsplat.open_scene("demo", device="cpu")
+    editor = Editor(scene)
+    lamp = np.array([5 * np.cos(-2.2), 5 * np.sin(-2.2), 4.4])  # tools/demo_scene/layouts.py
+    assert np.degrees(np.arccos(editor._light.toward @ lamp / np.linalg.norm(lamp))) < 5
+    count = len(scene.gaussians)
+    editor.duplicate(scene.find("blue mug"), Motion(translation=(0.0, -0.6, 0.0)))
+    copy = torch.arange(len(editor.scene.gaussians)) >= count
+    world = scene.find("blue mug").world
+    editor.delete(Selection(editor.scene.gaussians, {}, copy, copy.float(), phrase="mug", world=world))
+    fill = editor.steps[-1].values.get("fill", {"lit": 0})
+    assert fill["lit"] == 0, "it threw no shadow"
+
+
+def test_the_bar_of_the_light_ends_after_an_error(monkeypatch):
+    events = []
+    scene = lexsplat.open_scene("demo", device="cpu")
+    scene.listener = events.append
+    kinds = np.zeros(len(scene.gaussians), int)
+
+    def fails(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(shadows, "find_light", fails)
+    with pytest.raises(MemoryError):
+        shadows.light_of(scene, kinds)
+    assert [(event.done, event.total) for event in events if event.stage == "light"] == [(0, 1), (1, 1)]
