@@ -82,7 +82,7 @@ class Edit:
         shrink: Narrow the selection by this distance, in units of the scene or with a unit.
         largest: Change only the largest of the things found.
         fill: Close the surface under a thing that is deleted or moved, which no photo shows: the pattern around it
-            goes on; --no-fill leaves the hole.
+            goes on, and its shadow goes. --no-fill leaves the hole and the shadow.
         color: New color for recolor: three numbers in 0..1, "#ff8800" or a name such as orange.
         strength: Share of the new color, in 0..1.
         by: Shift along the axes of the scene, for move and duplicate: in units of the scene, or with units, such as
