@@ -39,9 +39,16 @@ class Builder:
 
     def begin(self, version: int) -> None:
         """The first half: new Gaussians beside the language of the old ones."""
+        self.start_anew()
+        self.reconstruct(version)
+
+    def start_anew(self) -> None:
+        """What a build does before it makes its first file."""
         keep_previous(self.folder)
         self.folder.save()
         self.folder.reopen("reconstruct")
+
+    def reconstruct(self, version: int) -> None:
         self.gaussians.means.copy_(self.start + version)
         self.folder.write_gaussians(self.gaussians)
         self.folder.finish("reconstruct", f"version {version}", 0.0)
@@ -148,6 +155,45 @@ def test_a_build_keeps_the_previous_scene_until_it_is_complete(built_copy, tiny_
     assert cli.main(["build", str(tiny_capture), "--output", str(built_copy), *changed]) == 0
     assert not (built_copy / "previous").exists()
     assert not torch.equal(open_scene(built_copy, device="cpu").gaussians.means, before)
+
+
+def test_a_reader_whose_version_the_next_build_replaces_reads_again(built_copy, monkeypatch):
+    builder = Builder(built_copy)
+    builder.begin(1)
+    builder.end(1)
+    builder.start_anew()
+    whole, calls = SceneFolder.read_gaussians, itertools.count()
+
+    def while_one_build_ends_and_another_starts(folder):
+        if next(calls) == 0:
+            builder.reconstruct(2)
+            builder.end(2)
+            builder.start_anew()
+        return whole(folder)
+
+    monkeypatch.setattr(SceneFolder, "read_gaussians", while_one_build_ends_and_another_starts)
+    assert version_of(open_scene(built_copy, device="cpu"), builder.start) == (2, 2)
+    assert next(calls) == 2, "it reads again"
+
+
+@pytest.mark.parametrize("times", [1, 9])
+def test_what_fails_once_is_read_again_and_what_fails_twice_is_damage(built_copy, monkeypatch, times):
+    whole, calls = SceneFolder.read_gaussians, itertools.count()
+
+    def damaged_at_first(folder):
+        if next(calls) < times:
+            raise FileFormatError(
+                folder.gaussians_path, expected="a PLY", found="noise", remedy="build again"
+            )
+        return whole(folder)
+
+    monkeypatch.setattr(SceneFolder, "read_gaussians", damaged_at_first)
+    if times == 1:
+        assert len(open_scene(built_copy, device="cpu").gaussians)
+        return
+    with pytest.raises(FileFormatError, match="noise"):
+        open_scene(built_copy, device="cpu")
+    assert next(calls) == 2
 
 
 def test_builds_that_outrun_a_reader_are_reported_and_not_taken_for_damage(built_copy, monkeypatch):

@@ -37,7 +37,7 @@ from lexsplat.queries.selection import Selection
 from lexsplat.runtime.progress import Event, Listener, silent
 from lexsplat.scenes.completing import brightening, completed
 from lexsplat.scenes.fills import COLUMNS, MOST, Fill
-from lexsplat.scenes.materials import THING, UNLISTED, materials
+from lexsplat.scenes.materials import THING, UNLISTED, are_listed, materials
 from lexsplat.scenes.shadows import Shadows
 from lexsplat.scenes.surfaces import (
     FEWEST,
@@ -68,6 +68,9 @@ _STUFFED = 0.5
 _REVEALED, _AROUND = 3.0, 1.3
 """Growth of a Gaussian's visible weight without the thing, above which it is deleted if it lies in the thing's hull,
 enlarged by the other factor. Both are chosen on the second scene."""
+_ALMOST_ALL, _SPECK = 5.0, 5.0
+"""The same for Gaussians below a thing, up to a radius of its foot below the surface, and how many pixels more the
+views must show: large dark ones, of which the photos hardly showed the rim."""
 _BORDER, _OVERLAP, _RIM = 3, 4, 3
 """Pixels around such places in which Gaussians are deleted, the fill overlaps the rest, and colors do not count."""
 _NEAR = 8
@@ -219,7 +222,8 @@ def _remains(place: _Place, gone: Mask, shown: Mask) -> tuple[Mask, Mask]:
     inside |= place.photo.at(place.unknown, local[:, :2]) & place.level & ~shown
     stuffing = _stuffing(place.views, place.own, gone | inside)
     inside |= stuffing & ~_standing(local, body, stuffing & shown)
-    revealed = _revealed(place.views, place.own, gone) & (local[:, 2] >= -THICK * radius)
+    around, below = _revealed(place.views, place.own, gone, -radius * place.surface.axes[2])
+    revealed = (around & (local[:, 2] >= -THICK * radius)) | (below & (local[:, 2] >= -radius))
     low, high = np.quantile(local[body, 2], [0.02, 0.98])
     if high - low < _SHEET * radius:  # on a cloth stand things, whose bottoms no photo shows
         revealed &= ~_standing(local, body, revealed)
@@ -262,7 +266,7 @@ def _fill_below(thing: Selection, gone: Mask, scene: _Scene) -> Fill | None:
     labels, others = materials(covered, known)
     if (known & ~others).sum() >= FEWEST:  # what stands on the surface is none of its pattern
         known &= ~others
-    listed = _are_listed(labels, covered, known)
+    listed = are_listed(labels, covered, known)
     painted, factors = _painted(place, hole, known, np.where(listed, labels, UNLISTED), scene.shadows)
     near = np.linalg.norm(local[:, :2] - surface.foot, axis=1) <= REACH * surface.radius
     # nobody knows what hidden Gaussians are
@@ -300,23 +304,6 @@ def _without_shadow(gaussians: Gaussians, gone: Mask, kinds: IntArray, shadows: 
     means = gaussians.means.detach().cpu().double().numpy()[asked]
     by[asked] = shadows.factors(means, kinds[asked])
     return _brightened(by)
-
-
-def _are_listed(labels: IntArray, covered: FloatArray, known: Mask) -> Mask:
-    """The pixels ``[P, P]`` of materials that are listed surfaces for the most part.
-
-    Args:
-        labels: The material of each pixel ``[P, P]``.
-        covered: How much of each pixel the Gaussians of each surface cover, and those of things ``[P, P, G + 1]``.
-        known: The pixels that count ``[P, P]``.
-    """
-    found = np.zeros(labels.shape, bool)
-    for label in np.unique(labels):
-        part = known & (labels == label)
-        found[labels == label] = (
-            part.any() and label < covered.shape[-1] - 1 and covered[part][:, label].mean() > 0.5
-        )
-    return found
 
 
 def _groups(kinds: IntArray) -> Mask:
@@ -417,16 +404,26 @@ def _stuffing(views: Views, own: Mask, gone: Mask) -> Mask:
     return found
 
 
-def _revealed(views: Views, own: Mask, gone: Mask) -> Mask:
-    """The Gaussians ``[N]`` around a thing of which the views show several times as much once the thing is gone."""
+def _revealed(views: Views, own: Mask, gone: Mask, down: FloatArray) -> tuple[Mask, Mask]:
+    """The Gaussians of which the views show several times as much once a thing is gone: those around it ``[N]``, and
+    below it ``[N]``.
+
+    Args:
+        views: The scene and its views.
+        own: The Gaussians of the thing ``[N]``.
+        gone: Those of all that goes ``[N]``.
+        down: How far below the thing is looked ``[3]``.
+    """
     means = views.gaussians.means.detach().cpu().double().numpy()
     places = np.flatnonzero(~gone)
-    places = places[inside_hull(means[own], means[places], _AROUND)]
-    found = np.zeros(len(gone), bool)
+    around = inside_hull(means[own], means[places], _AROUND)
+    below = inside_hull(np.concatenate([means[own], means[own] + down]), means[places], _AROUND)
+    places, around = places[around | below], around[around | below]
+    found = np.zeros((2, len(gone)), bool)
     if len(places):
         now, then = views.weights(places, gone)
-        found[places] = then > _REVEALED * now
-    return found
+        found[:, places] = (then > _REVEALED * now) & around, then > _ALMOST_ALL * now + _SPECK
+    return found[0], found[1]
 
 
 def _continued(heights: FloatArray, hole: Mask, known: Mask) -> FloatArray:

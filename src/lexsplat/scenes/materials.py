@@ -80,6 +80,23 @@ def materials(covered: FloatArray, known: Mask) -> tuple[IntArray, Mask]:
     return continued(found), things
 
 
+def are_listed(labels: IntArray, covered: FloatArray, known: Mask) -> Mask:
+    """The pixels ``[P, P]`` of materials that are listed surfaces for the most part.
+
+    Args:
+        labels: The material of each pixel ``[P, P]``.
+        covered: How much of each pixel the Gaussians of each surface cover, and those of things ``[P, P, G + 1]``.
+        known: The pixels that count ``[P, P]``.
+    """
+    found = np.zeros(labels.shape, bool)
+    for label in np.unique(labels):
+        part = known & (labels == label)
+        found[labels == label] = (
+            part.any() and label < covered.shape[-1] - 1 and covered[part][:, label].mean() > 0.5
+        )
+    return found
+
+
 def continued(found: IntArray) -> IntArray:
     """Materials ``[P, P]`` where they are not known, too.
 

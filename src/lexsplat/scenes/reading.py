@@ -70,19 +70,21 @@ def read_scene(path: Path, device: str) -> SceneContent:
         SceneFolderError: If there is neither, or builds change it faster than it is read.
         FileFormatError: If a file is damaged.
     """
-    device, attempts = choose_rasterizer(device), 0
+    device, attempts, failed = choose_rasterizer(device), 0, ""
     while True:
         folder = SceneFolder.open(path)
         attempts += 1
         try:
             return _read_content(version_that_answers(folder), device)
         except (SceneFolderError, FileFormatError) as error:
-            if _state(SceneFolder.open(path)) == _state(folder):
+            still = _state(SceneFolder.open(path)) == _state(folder)
+            if still and str(error) == failed:  # what is damaged is damaged when it is read again
                 if folder.record.get("edits"):  # a build is refused there
                     raise error.with_remedy(
                         "restore it from a copy, or edit and save the original again"
                     ) from error
                 raise
+            failed = str(error) if still else ""
             if attempts == _ATTEMPTS:  # a build in progress explains what is missing
                 raise SceneFolderError(
                     path,
